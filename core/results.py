@@ -147,7 +147,7 @@ class RunWriter:
         _replace(self.folder / f"{name}.pt", lambda file: torch.save(dict(state_dict), file))
 
     def finish(self, result: Mapping[str, Any]) -> None:
-        """Write `result.json`, which marks the run as finished. Arrays become lists, their scalars numbers."""
+        """Write `result.json`, which marks the run as finished. Arrays become lists of numbers."""
         text = json.dumps(result, indent=2, default=methodcaller("tolist")) + "\n"
         _replace(self.folder / "result.json", lambda file: file.write(text.encode()))
 

@@ -1,0 +1,115 @@
+"""The Gymnasium environment of a task: a robot that executes feasible actions only."""
+
+import difflib
+
+import gymnasium
+import numpy as np
+import torch
+
+from envs.tasks import TASKS
+
+TOLERANCE = 1e-6  # largest violation an executed action may have, in the units of `Constraint.violation`
+
+
+class InfeasibleActionError(ValueError):
+    """An action lies outside the task's feasible set at the current observation, or is no action at all."""
+
+
+def find_task(name):
+    """The `Task` called `name`; ValueError with the choices and the closest name where there is none."""
+    if name in TASKS:
+        return TASKS[name]
+    close = difflib.get_close_matches(str(name).upper(), TASKS, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    raise ValueError(f"unknown task {name!r}{hint} (choices: {' '.join(TASKS)})")
+
+
+class ActionConstrainedEnv(gymnasium.Env):
+    """A robot under the action constraint of one of the paper's tasks.
+
+    Observations are float64 (n,), actions (d,) in [-1, 1]. The violation of every action at the current
+    observation is computed in float64 before it is executed, and above 1e-6 the action is refused. With
+    `project`, an action outside the set is replaced by its projection instead, and
+    `info["executed_action"]` holds what was executed (float64, (d,)). The robot's time limit truncates.
+
+    Attributes: `constraint`; `largest_violation` (float) over all executed actions since construction, -inf
+    before the first; `executed_actions` (int), their number; `elapsed_steps` (int) of the current episode.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, task, project=False, render_mode=None):
+        found = find_task(task)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"unknown render_mode {render_mode!r} (choices: None 'rgb_array')")
+        self.task, self.constraint, self.project, self.render_mode = (
+            task,
+            found.constraint,
+            project,
+            render_mode,
+        )
+        self.robot = found.robot()
+        self.metadata = {**self.metadata, "render_fps": self.robot.fps}
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.robot.obs_dim,), np.float64)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.robot.action_dim,), np.float32)
+        self.largest_violation, self.executed_actions, self.elapsed_steps = -np.inf, 0, 0
+        self._obs = None  # current observation as a tensor of its own: callers may write into theirs
+
+    def reset(self, *, seed=None, options=None):
+        """Start an episode; return observation (n,) and info. `seed` as Gymnasium defines it."""
+        super().reset(seed=seed)
+        obs = self.robot.reset(self.np_random)
+        self._obs, self.elapsed_steps = torch.tensor(obs), 0
+        return obs, {}
+
+    def step(self, action):
+        """Execute `action` (d,); return observation, reward, terminated, truncated, info.
+
+        Raises InfeasibleActionError for a wrong shape, a value that is not finite or, without `project`, a
+        violation above 1e-6; gymnasium.error.ResetNeeded before the first reset.
+        """
+        if self._obs is None:
+            raise gymnasium.error.ResetNeeded(f"{self.task}: call reset() before step()")
+        action = self._feasible(action)
+        obs, reward, terminated, info = self.robot.step(action)
+        self._obs = torch.tensor(obs)
+        self.executed_actions += 1
+        self.elapsed_steps += 1
+        if self.project:
+            info["executed_action"] = np.array(action, np.float64)
+        return obs, reward, terminated, self.elapsed_steps >= self.robot.max_episode_steps, info
+
+    def render(self):
+        """Picture (480, 480, 3), uint8, of the current state; None without `render_mode="rgb_array"`."""
+        return self.robot.render() if self.render_mode == "rgb_array" else None
+
+    def close(self):
+        """Free simulator and renderer; closing twice is harmless."""
+        self.robot.close()
+        self._obs = None
+
+    def _feasible(self, action):
+        """The action to execute: `action` itself (in its own precision) or its projection."""
+        action = np.asarray(action)
+        if action.shape != self.action_space.shape:
+            expected = self.action_space.shape
+            raise InfeasibleActionError(
+                f"{self._where()}: action has shape {action.shape}, expected {expected}"
+            )
+        if not np.isfinite(action).all():
+            raise InfeasibleActionError(f"{self._where()}: action {action} is not finite")
+        exact = torch.tensor(action, dtype=torch.float64)
+        violation = self.constraint.violation(self._obs, exact).item()
+        if self.project and violation > 0:
+            exact = self.constraint.project(self._obs, exact)
+            action, violation = exact.numpy(), self.constraint.violation(self._obs, exact).item()
+        if not violation <= TOLERANCE:  # a NaN is refused as well
+            raise InfeasibleActionError(
+                f"{self._where()}: action {action} violates the constraint by {violation:.3g} "
+                f"(at most {TOLERANCE:g} is allowed)"
+            )
+        self.largest_violation = max(self.largest_violation, violation)
+        return action
+
+    def _where(self):
+        return f"{self.task}, step {self.elapsed_steps + 1} of the episode"

@@ -1,0 +1,195 @@
+"""HalfCheetah, Hopper and Walker2d on MuJoCo: step for step Gymnasium's `-v4` tasks (the v3 rewards)."""
+
+import ctypes.util
+import importlib
+import os
+import sys
+
+import gymnasium
+import numpy as np
+
+
+class _Locomotion:
+    """A planar robot that is rewarded for running along x.
+
+    Observation (nq - 1 + nv,): joint positions without the root's x, then joint velocities.
+    Action (nu,): joint torques in units of the model's gear ratios.
+    """
+
+    max_episode_steps = 1000
+    # filled by each robot
+    model_file: str
+    frame_skip: int
+    obs_dim: int
+    action_dim: int
+    ctrl_cost_weight: float
+    fps: int  # 1 / (time step of the model * frame_skip)
+
+    def __init__(self):
+        import mujoco
+
+        self._mujoco = mujoco
+        # Gymnasium's own path without its `envs.mujoco` package, which would load every MuJoCo task
+        assets = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
+        # half_cheetah.xml makes MuJoCo print a deprecation and leave a MUJOCO_LOG.TXT where the process runs
+        warning_handler = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(lambda message: None)
+        try:
+            self.model = mujoco.MjModel.from_xml_path(os.path.join(assets, self.model_file))
+        finally:
+            mujoco.set_mju_user_warning(warning_handler)
+        self.data = mujoco.MjData(self.model)
+        self._qpos, self._qvel = self.data.qpos, self.data.qvel  # views of the simulator's memory
+        self._dt = self.model.opt.timestep * self.frame_skip
+        self._picture = None
+
+    def reset(self, rng):
+        """Draw positions and velocities around the model's own from `rng` (numpy Generator); return obs."""
+        self._mujoco.mj_resetData(self.model, self.data)
+        self._perturb(rng)
+        self._mujoco.mj_forward(self.model, self.data)
+        return self._observe()
+
+    def step(self, action):
+        """Apply `action` (nu,) for `frame_skip` time steps; return observation, reward, terminated, info.
+
+        The control cost is summed in the action's own precision, as Gymnasium does.
+        """
+        x_before = float(self._qpos[0])
+        self.data.ctrl[:] = action
+        self._mujoco.mj_step(self.model, self.data, nstep=self.frame_skip)
+        x = float(self._qpos[0])
+        x_velocity = (x - x_before) / self._dt
+        ctrl_cost = float(self.ctrl_cost_weight * np.square(action).sum())
+        reward = x_velocity + self.healthy_reward - ctrl_cost
+        return self._observe(), reward, not self._healthy(), {"x_position": x, "x_velocity": x_velocity}
+
+    def render(self, width=480, height=480):
+        """Picture (height, width, 3), uint8, from the side, the camera following the robot.
+
+        Raises RuntimeError where no OpenGL backend works.
+        """
+        if self._picture is None:
+            self._picture = _Picture(self._mujoco, self.model, width, height)
+        return self._picture.take(self.data)
+
+    def close(self):
+        """Free the renderer; closing twice is harmless."""
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
+
+
+class HalfCheetah(_Locomotion):
+    """Never terminates. Observation (17,): angles 2:8, velocities 11:17, not clipped."""
+
+    model_file, frame_skip, obs_dim, action_dim = "half_cheetah.xml", 5, 17, 6
+    ctrl_cost_weight, healthy_reward = 0.1, 0.0
+    fps = 20
+
+    def _perturb(self, rng):
+        self._qpos += rng.uniform(-0.1, 0.1, self.model.nq)
+        self._qvel += 0.1 * rng.standard_normal(self.model.nv)
+
+    def _observe(self):
+        return np.concatenate((self._qpos[1:], self._qvel))
+
+    def _healthy(self):
+        return True
+
+
+class _Upright(_Locomotion):
+    """A robot that gets a bonus each step, the last one included, and terminates when it falls."""
+
+    frame_skip, ctrl_cost_weight, healthy_reward = 4, 1e-3, 1.0
+    fps = 125
+
+    def _perturb(self, rng):
+        self._qpos += rng.uniform(-5e-3, 5e-3, self.model.nq)
+        self._qvel += rng.uniform(-5e-3, 5e-3, self.model.nv)
+
+    def _observe(self):
+        return np.concatenate((self._qpos[1:], self._qvel.clip(-10.0, 10.0)))
+
+
+class Hopper(_Upright):
+    """Observation (11,): angles 2:5, velocities 8:11, clipped to +-10."""
+
+    model_file, obs_dim, action_dim = "hopper.xml", 11, 3
+
+    def _healthy(self):
+        z, angle = self._qpos[1:3].tolist()
+        state = self._qpos[2:].tolist() + self._qvel.tolist()
+        return z > 0.7 and abs(angle) < 0.2 and all(-100.0 < s < 100.0 for s in state)
+
+
+class Walker2d(_Upright):
+    """Observation (17,): angles 2:8, velocities 11:17, clipped to +-10."""
+
+    model_file, obs_dim, action_dim = "walker2d.xml", 17, 6
+
+    def _healthy(self):
+        z, angle = self._qpos[1:3].tolist()
+        return 0.8 < z < 2.0 and -1.0 < angle < 1.0
+
+
+def _gl_backend():
+    """Name of the OpenGL backend to use: MUJOCO_GL if set, otherwise one that fits this machine.
+
+    Chosen once and before anything is loaded: PyOpenGL cannot change its platform afterwards. It is chosen
+    here because `import mujoco` itself fails where MUJOCO_GL names a backend whose library is missing, and
+    training needs none.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    if chosen:
+        return chosen
+    if sys.platform == "darwin":
+        return "cgl"
+    if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        return "glfw"
+    for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
+        if ctypes.util.find_library(library):
+            return backend
+    raise RuntimeError(
+        "rendering without a display needs libEGL or libOSMesa, and neither is installed "
+        "(Debian, Ubuntu: apt-get install libegl1 or libosmesa6)"
+    )
+
+
+class _Picture:
+    """An off-screen OpenGL context with a camera that follows the robot's torso."""
+
+    def __init__(self, mujoco, model, width, height):
+        backend = _gl_backend()
+        try:
+            self._gl = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+            self._gl.make_current()
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        except Exception as error:  # each backend has errors of its own, an absent library an AttributeError
+            raise RuntimeError(
+                f"the OpenGL backend {backend!r} does not work on this machine ({error!r}); without a "
+                "display, install libegl1 or libosmesa6 and set MUJOCO_GL to 'egl' or 'osmesa'"
+            ) from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._mujoco, self._model = mujoco, model
+        self._scene, self._option = mujoco.MjvScene(model, maxgeom=1000), mujoco.MjvOption()
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+        self._camera.trackbodyid = model.body("torso").id
+        self._camera.distance, self._camera.azimuth, self._camera.elevation = 4.0, 90.0, -15.0
+
+    def take(self, data):
+        self._gl.make_current()
+        self._mujoco.mjv_updateScene(
+            self._model, data, self._option, None, self._camera, self._mujoco.mjtCatBit.mjCAT_ALL, self._scene
+        )
+        self._mujoco.mjr_render(self._viewport, self._scene, self._context)
+        pixels = np.empty((self._viewport.height, self._viewport.width, 3), np.uint8)
+        self._mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)
+        return pixels[::-1].copy()  # OpenGL counts rows from below
+
+    def close(self):
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()

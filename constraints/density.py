@@ -1,7 +1,7 @@
-"""Log-densities of a policy after the radial and alpha maps (paper, "Incorporating Action Constraints to SAC").
+"""Log-densities of a policy after the radial and alpha maps (paper, "Action Constraints to SAC").
 
-Both are exact up to rounding, and so are their first gradients: the two functions with a singular or cancelling
-closed form carry their own backward pass. Second derivatives are refused, not silently wrong.
+Both carry their gradients in closed form: autograd through the formulas would meet 0/0 or cancel, and cost more.
+A second derivative is refused by PyTorch, not silently wrong.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-_NODES = 32  # Gauss-Legendre nodes on the window of the ray integral
-_DROP = 30.0  # the window ends where the log of the integrand has fallen by at least this much
+_NODES = 28  # Gauss-Legendre nodes on the window of the ray integral
+_DROP = 25.0  # the window ends where the log of the integrand has fallen by at least this much
 
 
 class _RadialLogDet(torch.autograd.Function):
@@ -44,7 +44,7 @@ class _RadialLogDet(torch.autograd.Function):
 def radial_log_det(gauge: Tensor, dim: int) -> Tensor:
     """log |det J| of the radial map v -> tanh(L) / L v, that is (d - 1) log(tanh L / L) + log sech^2 L.
 
-    The determinant of the paper's Eq. (Jacobian of radial squashing), by Euler's identity for the homogeneous L.
+    The determinant of the paper's Jacobian of radial squashing, by Euler's identity for the homogeneous L.
 
     Args:
         gauge: (...) L >= 0 of the action before the map.
@@ -56,93 +56,107 @@ def radial_log_det(gauge: Tensor, dim: int) -> Tensor:
 
 
 @functools.lru_cache
-def _quadrature(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+def _quadrature(device: torch.device) -> tuple[Tensor, Tensor]:
     """Gauss-Legendre nodes and weights on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    return tuple(torch.as_tensor(x / 2, dtype=dtype, device=device) for x in (nodes + 1, weights))
+    return torch.as_tensor((nodes + 1) / 2, device=device), torch.as_tensor(weights / 2, device=device)
 
 
-class _LogRayIntegral(torch.autograd.Function):
+def log_ray_integral(slope: Tensor, intercept: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+    """log I(A, B), I = integral from 1 to infinity of t^(d-1) exp(-(A t + B)^2) dt, and its two derivatives.
+
+    Gauss-Legendre quadrature on a window around the mode that holds all but e^-25 of the integrand, whatever
+    A and B. All its terms are positive; those of the paper's recursion through erf cancel when B is large.
+
+    Args:
+        slope, intercept: (...) A > 0 and B, float64.
+        dim: d >= 1.
+    Returns:
+        (...) each: log I, d log I / dA, d log I / dB. Outside autograd.
+    """
+    # In w = A t, the log of the integrand is h(w) = k log(w / A) - (w + B)^2 on w >= A: concave (k = d - 1).
+    k = dim - 1
+    mode = torch.maximum((torch.sqrt(intercept.square() + 2 * k) - intercept) / 2, slope)
+    at_mode = mode + intercept
+    # From the mode, h falls by at least y^2 (1 + k / 2 mode^2) on the left, and on the right by at least each
+    # of s y + y^2 and k r^2 / (2 + 4 r / 3), where s = -h'(mode) and r = y / mode.
+    left = torch.minimum(mode - slope, torch.sqrt(_DROP / (1 + k / 2 / mode.square())))
+    fall = (2 * at_mode - k / mode).clamp_min(0)
+    right = 2 * _DROP / (fall + torch.sqrt(fall.square() + 4 * _DROP))
+    if k > 0:
+        reach = (2 * _DROP / 3 + math.sqrt(4 * _DROP**2 / 9 + 2 * k * _DROP)) / k
+        right = torch.minimum(right, mode * reach)
+    width = (left + right) / mode
+
+    # In place, as the temporaries of a large batch cost more to allocate than to fill.
+    nodes, weights = _quadrature(slope.device)
+    r = width[..., None] * nodes
+    r -= (left / mode)[..., None]
+    gauss = r * mode.square()[..., None]
+    gauss += (2 * mode * at_mode)[..., None]
+    gauss *= r
+    ratio = r.add_(1)  # t over its value at the mode
+    lower = ratio.log().mul_(k - 1).sub_(gauss).exp_()  # the integrand with t^(d-2), then with t^(d-1)
+    mass = (lower * ratio) @ weights * width
+    mean_inverse = lower @ weights * width / (mode * mass)  # E[1 / (A t)]
+
+    rise = k * torch.log(mode / slope)
+    log_integral = rise - at_mode.square() + torch.log(mass * (mode / slope))
+    # Integration by parts makes both derivatives sums of one sign; differences of moments would cancel:
+    # -d/dA = (e / I + d) / A and -d/dB = (e / I + (d - 1) E[1 / t]) / A, with e = exp(-(A + B)^2).
+    edge = torch.exp((mode - slope) * (at_mode + slope + intercept) - rise) / (mass * mode)  # e / (A I)
+    return log_integral, -(edge + dim / slope), -(edge + k * mean_inverse)
+
+
+class _AlphaBoundaryLogDensity(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, slope: Tensor, intercept: Tensor, dim: int) -> Tensor:
-        # In w = A t the log of the integrand is h(w) = k log(w / A) - (w + B)^2 on w >= A, with k = d - 1: concave.
-        k = dim - 1
-        start, shift = slope.double(), intercept.double()
-        root = torch.sqrt(shift.square() + 2 * k)
-        mode = torch.maximum((root - shift) / 2, start)
-        at_mode = mode + shift
-        # From the mode, h falls by at least y^2 (1 + k / 2 mode^2) to the left, and to the right by at least
-        # each of s y + y^2 and k r^2 / (2 + 4 r / 3), where s = -h'(mode) and r = y / mode.
-        left = torch.minimum(mode - start, torch.sqrt(_DROP / (1 + k / 2 / mode.square())))
-        fall = (2 * at_mode - k / mode).clamp_min(0)
-        right = 2 * _DROP / (fall + torch.sqrt(fall.square() + 4 * _DROP))
-        if k > 0:
-            right = torch.minimum(
-                right, mode * ((2 * _DROP / 3 + math.sqrt(4 * _DROP**2 / 9 + 2 * k * _DROP)) / k)
-            )
-        width = left + right
-
-        nodes, weights = _quadrature(torch.float64, slope.device)
-        y = torch.addcmul(-left[..., None], width[..., None], nodes)
-        ratio = 1 + y / mode[..., None]  # t over its value at the mode
-        lower = ratio.pow(k - 1) * torch.exp(-y * (y + 2 * at_mode[..., None]))
-        mass = (lower * ratio) @ weights * width
-        inverse = lower @ weights * width / mode / mass  # E[1 / (A t)]
-
-        rise = k * torch.log(mode / start)
-        log_integral = rise - at_mode.square() + torch.log(mass / start)
-        # Integration by parts turns both derivatives into sums of one sign (no difference of moments):
-        # d/dA = -(1 / I)(e + d I) / A,  d/dB = -(1 / I)(e + (d - 1) I_{d-1}) / A,  e = exp(-(A + B)^2).
-        edge = torch.exp((mode - start) * (mode + start + 2 * shift) - rise) / mass  # e / (A I)
-        ctx.save_for_backward(-(edge + dim / start), -(edge + k * inverse))
-        ctx.dtypes = slope.dtype, intercept.dtype
-        return log_integral.to(torch.promote_types(*ctx.dtypes))
+    def forward(ctx, boundary_offset, gauge_gradient, center, mean, std):
+        dim = boundary_offset.shape[-1]
+        normal, std = gauge_gradient.double(), std.double()
+        ray = boundary_offset.double() / std
+        start = (center.double() - mean.double()) / std
+        # |start + t ray|^2 / 2 = (A t + B)^2 + |residual|^2 / 2, with A = |ray| / sqrt 2, B = A foot, and the
+        # residual orthogonal to the ray: a sum of squares, not a difference of large ones.
+        square = ray.square().sum(-1, keepdim=True)
+        foot = (start * ray).sum(-1, keepdim=True) / square
+        residual = start - foot * ray
+        slope = torch.sqrt(square / 2)
+        log_integral, by_slope, by_intercept = log_ray_integral(slope[..., 0], (slope * foot)[..., 0], dim)
+        normal_square = normal.square().sum(-1)
+        ctx.save_for_backward(normal, normal_square, std, ray, foot, residual, slope, by_slope, by_intercept)
+        per_axis = residual.square() / 2 + std.log() + 0.5 * math.log(2 * math.pi)
+        return (log_integral - per_axis.sum(-1) - normal_square.log() / 2).to(boundary_offset.dtype)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-        by_slope, by_intercept = ctx.saved_tensors
-        slope_type, intercept_type = ctx.dtypes
-        return (grad * by_slope).to(slope_type), (grad * by_intercept).to(intercept_type), None
-
-
-def log_ray_integral(slope: Tensor, intercept: Tensor, dim: int) -> Tensor:
-    """log of the integral from 1 to infinity of t^(d-1) exp(-(A t + B)^2) dt.
-
-    Gauss-Legendre quadrature on a window around the mode, which holds all but e^-30 of the integrand whatever A, B.
-
-    Args:
-        slope: (...) A > 0.
-        intercept: (...) B, of the same shape.
-        dim: d >= 1.
-    """
-    return _LogRayIntegral.apply(slope, intercept, dim)
+    def backward(ctx, grad):
+        normal, normal_square, std, ray, foot, residual, slope, by_slope, by_intercept = ctx.saved_tensors
+        grad = grad.double()
+        # Derivatives by start and ray are -E[start + t ray] and -E[t (start + t ray)] under the integrand.
+        weight = grad[..., None]
+        offset = (grad * by_intercept)[..., None] / (2 * slope)  # -E[t + foot]
+        moment = (grad * by_slope)[..., None] / (2 * slope)  # -E[t (t + foot)]
+        by_start = offset * ray - weight * residual
+        by_ray = moment * ray + (offset + weight * foot) * residual
+        by_std = -(weight + by_ray * ray + by_start * (residual + foot * ray)) / std
+        by_center = by_start / std
+        by_normal = -normal * (grad / normal_square)[..., None]
+        return by_ray / std, by_normal, by_center, -by_center, by_std
 
 
 def alpha_boundary_log_density(
     boundary_offset: Tensor, gauge_gradient: Tensor, center: Tensor, mean: Tensor, std: Tensor
 ) -> Tensor:
-    """Log-density, per unit of surface, of N(mean, diag std^2) after the alpha map, at a point of the boundary.
+    """Log-density, per unit of surface, of N(mean, diag std^2) after the alpha map, at a boundary point b.
 
-    q(b) = 1 / |grad L| * integral from 1 to infinity of N(c + t (b - c)) t^(d-1) dt: the paper's q dsigma, with
-    dOmega = r0^(1-d) cos(theta) dsigma (its print has r0^-1, the case d = 2). Computed in float64 throughout.
+    q(b) = 1 / |grad L| * integral from 1 to infinity of N(c + t (b - c)) t^(d-1) dt: the paper's q dsigma
+    with dOmega = r0^(1-d) cos(theta) dsigma (it prints r0^-1, the case d = 2). Computed in float64 inside.
 
     Args:
-        boundary_offset: (..., d) b - c, with gauge L(b - c) = 1, so never zero.
+        boundary_offset: (..., d) b - c, where the gauge L is 1 (never zero, therefore).
         gauge_gradient: (..., d) gradient of L there, or anywhere else on the ray.
         center, mean, std: (..., d) c, and the Gaussian before the map.
     Returns:
-        (...) log q(b), in the type of the arguments.
+        (...) log q(b), in the type of `boundary_offset`.
     """
-    dim = boundary_offset.shape[-1]
-    scale = std.double()
-    ray = boundary_offset.double() / scale
-    start = (center.double() - mean.double()) / scale
-    # |start + t ray|^2 / 2 = (A t + B)^2 + |residual|^2 / 2, the residual being orthogonal to the ray
-    length = torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
-    along = (start * ray).sum(-1, keepdim=True) / length
-    residual = start - along / length * ray
-    log_ray = log_ray_integral(length[..., 0] * math.sqrt(0.5), along[..., 0] * math.sqrt(0.5), dim)
-    log_normal = (-0.5 * residual.square() - scale.log()).sum(-1) - dim / 2 * math.log(2 * math.pi)
-    log_density = log_ray + log_normal - torch.linalg.vector_norm(gauge_gradient.double(), dim=-1).log()
-    return log_density.to(boundary_offset.dtype)
+    return _AlphaBoundaryLogDensity.apply(boundary_offset, gauge_gradient, center, mean, std)

@@ -1,0 +1,31 @@
+"""NFW: Neural Frank-Wolfe Policy Optimization (Lin et al., 2021) with TD3's techniques (paper, Section "NFWPO").
+
+Critics, exploration and targets are TD3's with projected actions. The actor does not follow the critic's gradient
+through the projection; it is drawn to a reference action that a Frank-Wolfe step finds inside the feasible set.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from algos.td3 import TD3
+from core.replay import Batch
+
+
+class NFWPO(TD3):
+    """TD3 whose actor regresses on Frank-Wolfe reference actions."""
+
+    def actor_loss(self, batch: Batch) -> Tensor:
+        """|mu(s) - a_s|^2, no gradient through a_s: mean over the batch, sum over seeds."""
+        suggested = self.suggest(self.actor, batch.obs)
+        reference = self.reference_action(batch.obs, suggested.detach())
+        return (suggested - reference).square().sum(-1).mean(-1).sum()
+
+    def reference_action(self, obs: Tensor, suggested: Tensor) -> Tensor:
+        """a_s = P_s(mu(s) + alpha (c_s - P_s(mu(s)))), c_s = argmax over the set of <c, grad_a Q_1(s, P_s(mu(s)))>."""
+        projected = self.constraint.project(obs, suggested).requires_grad_()
+        (gradient,) = torch.autograd.grad(self.critic.first(obs, projected).sum(), projected)
+        vertex = self.constraint.linear_oracle(obs, gradient)
+        step = self.config.fw_learning_rate * (vertex - projected.detach())
+        return self.constraint.project(obs, suggested + step)

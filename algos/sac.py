@@ -1,0 +1,185 @@
+"""SAC under action constraints: SPre, SPre+, SAlpha and SRad.
+
+Haarnoja et al. (2018) with a learned temperature and a feasibility map (paper, Section "Incorporating Action
+Constraints to SAC"). The actor's Gaussian is squashed by tanh before the environment projects (SPre), or mapped into
+the feasible set by the alpha or radial map, whose log-densities `constraints` gives in closed form. On Reacher the
+exploration noise is state-dependent (gSDE, Raffin et al. 2022).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from constraints import Constraint
+from core.agent import Agent
+from core.config import Config
+from core.networks import MLP, TwinCritic, adam, descend, frozen_copy, rows_of, soft_update
+from core.random import Streams
+from core.replay import Batch
+
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+
+
+class GaussianActor(nn.Module):
+    """Mean and standard deviation from one network; noise independent at every step."""
+
+    def __init__(self, obs_dim: int, action_dim: int, hidden: Sequence[int], generators: Sequence[torch.Generator]):
+        super().__init__()
+        self.net = MLP([obs_dim, *hidden, 2 * action_dim], generators)
+        self.noise_shape = (action_dim,)
+
+    def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation (seeds, batch, d) of the action before any map."""
+        mean, log_std = self.net(obs).chunk(2, dim=-1)
+        return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX).exp()
+
+    def sample(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A reparametrised sample, with its mean and std; `noise` standard normal (seeds, batch, d)."""
+        mean, std = self(obs)
+        return mean + std * noise, mean, std
+
+
+class StateDependentActor(nn.Module):
+    """gSDE: noise is latent . theta, so that it varies smoothly with the state while theta stays the same.
+
+    theta (latent, d) is normal with standard deviation exp(log_std), hence the noise of one state is normal with
+    variance latent^2 . std^2. The latent features are the last hidden layer's, and noise trains them too.
+    """
+
+    MEAN_BOUND = 2.0
+    LOG_STD_INIT = -3.0
+    VARIANCE_FLOOR = 1e-6  # all latent features of a state may be zero; the density must not be infinite there
+
+    def __init__(self, obs_dim: int, action_dim: int, hidden: Sequence[int], generators: Sequence[torch.Generator]):
+        super().__init__()
+        self.features = MLP([obs_dim, *hidden], generators)
+        self.mean = MLP([hidden[-1], action_dim], generators)
+        self.log_std = nn.Parameter(torch.full((len(generators), hidden[-1], action_dim), self.LOG_STD_INIT))
+        self.noise_shape = (hidden[-1], action_dim)
+
+    def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation (seeds, batch, d) of the action before any map."""
+        mean, std, _ = self._moments(obs)
+        return mean, std
+
+    def _moments(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        latent = self.features(obs).relu()
+        mean = self.mean(latent).clamp(-self.MEAN_BOUND, self.MEAN_BOUND)
+        variance = latent.square() @ self.log_std.exp().square()
+        return mean, (variance + self.VARIANCE_FLOOR).sqrt(), latent
+
+    def sample(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A reparametrised sample, with its mean and std; `noise` standard normal (seeds, latent, d)."""
+        mean, std, latent = self._moments(obs)
+        return mean + latent @ (self.log_std.exp() * noise), mean, std
+
+
+class SAC(Agent):
+    """Soft actor-critic for all seeds at once; tensors are (seeds, batch, features)."""
+
+    def __init__(self, config: Config, constraint: Constraint, obs_dim: int, seeds: Sequence[int], **placement):
+        super().__init__(config, constraint, obs_dim, seeds, **placement)
+        init = Streams(seeds, "init").generators
+        actor_class = StateDependentActor if config.gsde else GaussianActor
+        self.actor = actor_class(obs_dim, self.action_dim, config.hidden, init).to(config.device)
+        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init).to(config.device)
+        self.critic_target = frozen_copy(self.critic)
+        self.temperature = Temperature(len(seeds)).to(config.device)
+        self.actor_optimizer = adam(self.actor.parameters(), config.learning_rate)
+        self.critic_optimizer = adam(self.critic.parameters(), config.learning_rate)
+        self.temperature_optimizer = adam(self.temperature.parameters(), config.learning_rate)
+        self.target_entropy = -float(self.action_dim)
+        self.rollout_noise = torch.zeros(len(seeds), *self.actor.noise_shape, device=config.device)
+
+    def networks(self) -> dict[str, nn.Module]:
+        return {
+            "actor": self.actor,
+            "critic": self.critic,
+            "critic_target": self.critic_target,
+            "temperature": self.temperature,
+        }
+
+    def start_rollout(self, only: Sequence[int]) -> None:
+        """gSDE keeps one theta for a rollout."""
+        if self.config.gsde:
+            fresh = self.exploration.normal(*self.actor.noise_shape, only=only)
+            for i in only:
+                self.rollout_noise[i] = fresh[i]
+
+    @torch.no_grad()
+    def explore(self, obs: Tensor, only: Sequence[int]) -> Tensor:
+        if self.config.gsde:
+            noise = self.rollout_noise
+        else:
+            noise = self.exploration.normal(*self.actor.noise_shape, only=only).to(obs.device).unsqueeze(1)
+        raw, _, _ = self.actor.sample(obs.unsqueeze(1), noise)
+        return self.suggest(raw.squeeze(1))
+
+    def suggest(self, raw: Tensor) -> Tensor:
+        """The action before the map, in the box where a projection follows."""
+        return raw.tanh() if self.bounded else raw
+
+    def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:
+        actor = rows_of(self.actor, which)
+
+        @torch.no_grad()
+        def act(obs: Tensor) -> Tensor:
+            mean, _ = actor(obs)
+            return self.feasible(obs, self.suggest(mean), None)
+
+        return act
+
+    def sample(self, obs: Tensor, center: Tensor | None, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """An action as the critic sees it, its log-density (seeds, batch), and the suggestion before the map."""
+        raw, mean, std = self.actor.sample(obs, noise)
+        suggested = self.suggest(raw)
+        if self.mapping == "alpha":
+            log_prob = self.constraint.alpha_log_prob(obs, raw, mean, std, center)
+            return self.feasible(obs, suggested, center), log_prob, suggested
+        normal = -0.5 * ((raw - mean) / std).square() - std.log() - 0.5 * math.log(2 * math.pi)
+        if self.mapping == "radial":
+            log_prob = self.constraint.radial_log_prob(obs, raw, normal.sum(-1), center)
+            return self.feasible(obs, suggested, center), log_prob, suggested
+        log_slope = 2 * (math.log(2) - raw - softplus(-2 * raw))  # of tanh, exact however far out
+        return suggested, (normal - log_slope).sum(-1), suggested
+
+    def update(self, batch: Batch) -> None:
+        """One step of temperature, critics and actor, in this order."""
+        noise, next_noise = self.draw_noise(batch)
+        action, log_prob, suggested = self.sample(batch.obs, batch.center, noise)
+
+        alpha = self.temperature.log_alpha.detach().exp()
+        surplus = (log_prob.detach() + self.target_entropy).mean(-1, keepdim=True)
+        descend(self.temperature_optimizer, -(self.temperature.log_alpha * surplus).sum())
+
+        with torch.no_grad():
+            next_action, next_log_prob, _ = self.sample(batch.next_obs, batch.next_center, next_noise)
+            next_value = self.critic_target(batch.next_obs, next_action).amin(0) - alpha * next_log_prob
+            q_target = batch.reward + self.config.gamma * (1 - batch.terminated) * next_value
+        q = self.critic(batch.obs, batch.action)
+        descend(self.critic_optimizer, 0.5 * (q - q_target).square().mean(-1).sum())
+
+        value = self.critic(batch.obs, action).amin(0) - alpha * log_prob
+        descend(self.actor_optimizer, (self.penalty(batch.obs, suggested) - value).mean(-1).sum())
+        soft_update(self.critic_target, self.critic, self.config.tau)
+
+    def draw_noise(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Noise for the samples at s and at s': with gSDE one theta serves both, for the whole batch."""
+        if self.config.gsde:
+            theta = self.update_noise.normal(*self.actor.noise_shape).to(batch.obs.device)
+            return theta, theta
+        noise = self.update_noise.normal(2, *batch.action.shape[1:]).to(batch.obs.device)
+        return noise[:, 0], noise[:, 1]
+
+
+class Temperature(nn.Module):
+    """The entropy coefficient alpha of every seed, learned in its logarithm, starting at 1."""
+
+    def __init__(self, seeds: int):
+        super().__init__()
+        self.log_alpha = nn.Parameter(torch.zeros(seeds, 1))

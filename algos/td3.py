@@ -1,0 +1,100 @@
+"""TD3 under action constraints: DPro, DPre, DOpt, DAlpha, DRad and their + variants.
+
+Fujimoto et al. (2018) with a feasibility map P_s between the actor mu and the critics (paper, Sections "Algorithms
+Based on the Closest Point Projection" and "Other Mapping Techniques"). The names differ only in which map, where it
+stands (`core.agent.Agent`) and whether the penalty for infeasible suggestions joins the actor's loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from constraints import Constraint
+from core.agent import Agent
+from core.config import Config
+from core.networks import MLP, TwinCritic, adam, descend, frozen_copy, rows_of, soft_update
+from core.random import Streams
+from core.replay import Batch
+
+
+class TD3(Agent):
+    """Twin delayed DDPG for all seeds at once; tensors are (seeds, batch, features)."""
+
+    def __init__(self, config: Config, constraint: Constraint, obs_dim: int, seeds: Sequence[int], **placement):
+        super().__init__(config, constraint, obs_dim, seeds, **placement)
+        init = Streams(seeds, "init").generators
+        self.actor = MLP([obs_dim, *config.hidden, self.action_dim], init).to(config.device)
+        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init).to(config.device)
+        self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
+        self.actor_optimizer = adam(self.actor.parameters(), config.learning_rate)
+        self.critic_optimizer = adam(self.critic.parameters(), config.learning_rate)
+        self.updates = 0
+
+    def networks(self) -> dict[str, nn.Module]:
+        return {
+            "actor": self.actor,
+            "critic": self.critic,
+            "actor_target": self.actor_target,
+            "critic_target": self.critic_target,
+        }
+
+    def suggest(self, actor: MLP, obs: Tensor) -> Tensor:
+        """mu(s): the action before the map, in the box where a projection follows."""
+        return actor(obs).tanh() if self.bounded else actor(obs)
+
+    @torch.no_grad()
+    def explore(self, obs: Tensor, only: Sequence[int]) -> Tensor:
+        noise = self.config.action_noise * self.exploration.normal(self.action_dim, only=only).to(obs.device)
+        suggested = self.suggest(self.actor, obs.unsqueeze(1)).squeeze(1) + noise
+        return suggested.clamp(-1.0, 1.0) if self.bounded else suggested
+
+    def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:
+        actor = rows_of(self.actor, which)
+
+        @torch.no_grad()
+        def act(obs: Tensor) -> Tensor:
+            return self.feasible(obs, self.suggest(actor, obs), None)
+
+        return act
+
+    def update(self, batch: Batch) -> None:
+        """A step of both critics and, every `policy_delay` steps, of the actor and the targets."""
+        q_target = self.bootstrap(batch)
+        q = self.critic(batch.obs, batch.action)
+        descend(self.critic_optimizer, (q - q_target).square().mean(-1).sum())
+
+        self.updates += 1
+        if self.updates % self.config.policy_delay == 0:
+            descend(self.actor_optimizer, self.actor_loss(batch))
+            soft_update(self.actor_target, self.actor, self.config.tau)
+            soft_update(self.critic_target, self.critic, self.config.tau)
+
+    @torch.no_grad()
+    def bootstrap(self, batch: Batch) -> Tensor:
+        """r + gamma min_j Q'_j(s', a'), a' the smoothed target action: (seeds, batch)."""
+        next_action = self.target_action(batch)
+        next_q = self.critic_target(batch.next_obs, next_action).amin(0)
+        return batch.reward + self.config.gamma * (1 - batch.terminated) * next_q
+
+    def target_action(self, batch: Batch) -> Tensor:
+        """The target actor's action, as the critic would see it, with clipped noise; then back into bounds."""
+        action = self.suggest(self.actor_target, batch.next_obs)
+        if self.placement != "environment":
+            action = self.feasible(batch.next_obs, action, batch.next_center)
+        noise = self.update_noise.normal(*action.shape[1:]).to(action.device) * self.config.target_noise
+        action = action + noise.clamp(-self.config.target_noise_clip, self.config.target_noise_clip)
+        if self.bounded:
+            return action.clamp(-1.0, 1.0)
+        return self.pull_back(batch.next_obs, action, batch.next_center)
+
+    def actor_loss(self, batch: Batch) -> Tensor:
+        """-Q_1 at the actor's action plus the penalty: mean over the batch, sum over seeds."""
+        suggested = self.suggest(self.actor, batch.obs)
+        action = suggested
+        if self.placement == "layer":
+            action = self.feasible(batch.obs, suggested, batch.center)
+        q = self.critic.first(batch.obs, action)
+        return (self.penalty(batch.obs, suggested) - q).mean(-1).sum()

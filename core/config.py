@@ -1,0 +1,227 @@
+"""The configuration: one typed dataclass, the paper's hyperparameter table, and the parsing of `key=value`."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+
+class ConfigError(ValueError):
+    """A setting that the user can put right; its message is one line that names the value and the choices."""
+
+
+@dataclass
+class Config:
+    """Every setting of one run. `None` marks a setting that the chosen algorithm does not have."""
+
+    algo: str
+    env: str
+    seed: str = field(default="0", metadata={"help": "seeds trained in lockstep: 3, 0-9 or 1,4,7"})
+    steps: int = field(default=0, metadata={"help": "environment steps of each seed"})
+    # Hyperparameters of the paper's table "Hyperparameters used in the experiments".
+    gamma: float = field(default=0.99, metadata={"help": "discount factor"})
+    hidden: list[int] = field(default_factory=lambda: [400, 300], metadata={"help": "hidden layer widths"})
+    batch_size: int = field(default=100, metadata={"help": "transitions in a gradient step"})
+    learning_rate: float = field(default=1e-3, metadata={"help": "Adam's, for every network"})
+    buffer_size: int = field(default=1_000_000, metadata={"help": "transitions kept for replay, a seed"})
+    tau: float = field(default=0.005, metadata={"help": "target update ratio"})
+    action_noise: float | None = field(default=None, metadata={"help": "TD3, NFW: std of exploration noise"})
+    fw_learning_rate: float | None = field(default=None, metadata={"help": "NFW: Frank-Wolfe step"})
+    learning_starts: int = field(default=100_000, metadata={"help": "random warm-up steps"})
+    gsde: bool | None = field(default=None, metadata={"help": "SAC: state-dependent exploration"})
+    train_freq: str = field(default="1", metadata={"help": "steps in a rollout, or 'episode'"})
+    gradient_steps: int = field(default=1, metadata={"help": "after each rollout; -1: as many as its steps"})
+    # Constants of TD3 and of the penalty term, which the paper takes from their sources.
+    policy_delay: int | None = field(default=None, metadata={"help": "TD3, NFW: critic steps an actor step"})
+    target_noise: float | None = field(default=None, metadata={"help": "TD3, NFW: std of target smoothing"})
+    target_noise_clip: float | None = field(default=None, metadata={"help": "TD3, NFW: bound of that noise"})
+    penalty: float | None = field(default=None, metadata={"help": "names with +: weight of the penalty"})
+    # Protocol.
+    eval_every: int = field(default=5_000, metadata={"help": "environment steps between evaluations"})
+    eval_episodes: int = field(default=5, metadata={"help": "episodes of an evaluation"})
+    final_episodes: int = field(default=50, metadata={"help": "episodes of the final result"})
+    # The run itself; none of these changes what is learned, beyond float rounding.
+    results: str = field(default="results", metadata={"help": "folder that results go to"})
+    overwrite: bool = field(default=False, metadata={"help": "run a finished run again; the old one is kept"})
+    threads: int = field(default=1, metadata={"help": "CPU threads of PyTorch"})
+    device: str = field(default="cpu", metadata={"help": "cpu or cuda"})
+
+
+RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "threads", "device")
+"""Settings that do not make a run another experiment: they never show in a run's name."""
+
+TD3_CONSTANTS = {"policy_delay": 2, "target_noise": 0.2, "target_noise_clip": 0.5}
+
+HYPERPARAMETERS: dict[tuple[str, str], dict] = {
+    # (robot, base algorithm): the paper's Table "Hyperparameters used in the experiments".
+    ("Reacher", "TD3"): {
+        "gamma": 0.98, "hidden": [400, 300], "batch_size": 100, "learning_rate": 1e-3,
+        "buffer_size": 200_000, "tau": 0.005, "action_noise": 0.1, "fw_learning_rate": 0.05,
+        "learning_starts": 100_000, "train_freq": "episode", "gradient_steps": -1,
+    },
+    ("Reacher", "SAC"): {
+        "gamma": 0.98, "hidden": [400, 300], "batch_size": 256, "learning_rate": 7.3e-4,
+        "buffer_size": 300_000, "tau": 0.02, "gsde": True,
+        "learning_starts": 100_000, "train_freq": "8", "gradient_steps": 8,
+    },
+    ("Hopper", "TD3"): {
+        "gamma": 0.99, "hidden": [400, 300], "batch_size": 256, "learning_rate": 3e-4,
+        "buffer_size": 1_000_000, "tau": 0.005, "action_noise": 0.1, "fw_learning_rate": 0.01,
+        "learning_starts": 100_000, "train_freq": "1", "gradient_steps": 1,
+    },
+    ("Hopper", "SAC"): {
+        "gamma": 0.99, "hidden": [256, 256], "batch_size": 256, "learning_rate": 3e-4,
+        "buffer_size": 1_000_000, "tau": 0.005, "gsde": False,
+        "learning_starts": 100_000, "train_freq": "1", "gradient_steps": 1,
+    },
+    ("Others", "TD3"): {
+        "gamma": 0.99, "hidden": [400, 300], "batch_size": 100, "learning_rate": 1e-3,
+        "buffer_size": 1_000_000, "tau": 0.005, "action_noise": 0.1, "fw_learning_rate": 0.01,
+        "learning_starts": 100_000, "train_freq": "episode", "gradient_steps": -1,
+    },
+    ("Others", "SAC"): {
+        "gamma": 0.99, "hidden": [256, 256], "batch_size": 256, "learning_rate": 3e-4,
+        "buffer_size": 1_000_000, "tau": 0.005, "gsde": False,
+        "learning_starts": 100_000, "train_freq": "1", "gradient_steps": 1,
+    },
+}  # fmt: skip
+
+
+def defaults(algo: str, env: str, robot: str, base: str, frank_wolfe: bool, penalty: bool, steps: int) -> Config:
+    """The paper's configuration of one cell.
+
+    `robot` is the task's robot, `base` is "TD3" or "SAC"; `frank_wolfe` and `penalty` say whether the algorithm
+    takes Frank-Wolfe steps and has the penalty term; `steps` is the task's length of training.
+    """
+    group = robot if robot in ("Reacher", "Hopper") else "Others"
+    table = dict(HYPERPARAMETERS[group, base])
+    if base == "TD3":
+        table |= TD3_CONSTANTS
+    if not frank_wolfe:
+        table.pop("fw_learning_rate", None)
+    if penalty:
+        table["penalty"] = 1.0
+    return Config(algo=algo, env=env, steps=steps, **table)
+
+
+def choose(kind: str, value: str, choices: Iterable[str]) -> str:
+    """`value` if it is one of `choices`, else a ConfigError that names them and the closest one."""
+    choices = list(choices)
+    if value in choices:
+        return value
+    by_folded = {choice.casefold(): choice for choice in choices}
+    close = difflib.get_close_matches(value.casefold(), by_folded, n=1, cutoff=0.6)
+    hint = f"; did you mean {by_folded[close[0]]}?" if close else ""
+    raise ConfigError(f"unknown {kind} {value!r}{hint} (choices: {', '.join(choices)})")
+
+
+def parse_arguments(arguments: Iterable[str]) -> dict[str, str]:
+    """`key=value` words as a dict. Raises ConfigError for a word of another form, an unknown key or one given twice."""
+    overrides: dict[str, str] = {}
+    names = [f.name for f in fields(Config)]
+    for word in arguments:
+        key, equals, value = word.partition("=")
+        if not equals or not value:
+            raise ConfigError(f"expected key=value, got {word!r}")
+        choose("key", key, names)
+        if key in overrides:
+            raise ConfigError(f"key {key!r} given twice: {overrides[key]!r} and {value!r}")
+        overrides[key] = value
+    return overrides
+
+
+def split_names(kind: str, value: str, choices: Iterable[str]) -> list[str]:
+    """A comma list of names, or `all`, in the order of `choices`; ConfigError names a wrong one."""
+    choices = list(choices)
+    if value == "all":
+        return choices
+    wanted = {choose(kind, name, [*choices, "all"]) for name in value.split(",")}
+    return choices if "all" in wanted else [name for name in choices if name in wanted]
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Seeds of `3`, `0-9`, `1,4,7` or a mixture, ascending and without repetition."""
+    seeds: set[int] = set()
+    for part in text.split(","):
+        first, dash, last = part.partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise ConfigError(f"bad seed {text!r} (examples: seed=3, seed=0-9, seed=1,4,7)")
+        low, high = int(first), int(last or first)
+        if high < low:
+            raise ConfigError(f"bad seed {text!r}: the range {part!r} is empty")
+        if high - low >= 1000 or high >= 2**31:
+            raise ConfigError(f"bad seed {text!r}: at most 1000 seeds a range, each below 2^31")
+        seeds.update(range(low, high + 1))
+    return sorted(seeds)
+
+
+def _typed(key: str, text: str) -> object:
+    """The text of one override as the type of its field; ConfigError if it has no such value."""
+    kind = typing.get_type_hints(Config)[key]
+    if kind is str:
+        return text
+    try:
+        value = OmegaConf.from_dotlist([f"value={text}"]).value
+    except (OmegaConfBaseException, ValueError) as error:
+        raise ConfigError(f"bad value {text!r} for {key}: {str(error).splitlines()[0]}") from None
+    if kind is list[int] or typing.get_origin(kind) is list:
+        value = value if OmegaConf.is_list(value) else [int(v) if v.isdecimal() else v for v in text.split(",")]
+    if int in (kind, *typing.get_args(kind)) and isinstance(value, float) and value.is_integer():
+        value = int(value)  # 3e5 is a whole number to a person, a float to YAML
+    return value
+
+
+def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
+    """`base` with the overrides, type-checked by OmegaConf and range-checked; ConfigError for what does not fit."""
+    config = OmegaConf.structured(base)
+    for key, text in overrides.items():
+        if key in ("algo", "env"):
+            continue
+        if getattr(base, key) is None:
+            raise ConfigError(f"{key} does not apply to {base.algo}")
+        if text in ("null", "None", "~"):
+            raise ConfigError(f"bad value {text!r} for {key}: a value is needed")
+        try:
+            config[key] = _typed(key, text)
+        except OmegaConfBaseException:
+            kind = next(f.type for f in fields(Config) if f.name == key).replace(" | None", "")
+            raise ConfigError(f"bad value {text!r} for {key}: expected {kind}") from None
+    resolved: Config = OmegaConf.to_object(config)
+    _check_ranges(resolved)
+    return resolved
+
+
+def _check_ranges(config: Config) -> None:
+    def demand(key: str, ok: bool, what: str) -> None:
+        if not ok:
+            raise ConfigError(f"bad value {getattr(config, key)!r} for {key}: {what}")
+
+    for key, value in asdict(config).items():
+        if isinstance(value, float):
+            demand(key, math.isfinite(value), "must be finite")
+    for key in ("steps", "batch_size", "buffer_size", "eval_every", "eval_episodes", "final_episodes", "threads"):
+        demand(key, getattr(config, key) >= 1, "must be at least 1")
+    for key in ("learning_starts", "action_noise", "target_noise", "target_noise_clip", "penalty"):
+        demand(key, (getattr(config, key) or 0) >= 0, "must not be negative")
+    demand("gamma", 0 <= config.gamma <= 1, "must be in [0, 1]")
+    demand("tau", 0 < config.tau <= 1, "must be in (0, 1]")
+    demand("learning_rate", config.learning_rate > 0, "must be positive")
+    demand("fw_learning_rate", 0 < (config.fw_learning_rate or 1.0) <= 1, "must be in (0, 1]")
+    demand("policy_delay", (config.policy_delay or 1) >= 1, "must be at least 1")
+    demand("hidden", len(config.hidden) >= 1 and min(config.hidden) >= 1, "must list positive widths")
+    demand("gradient_steps", config.gradient_steps == -1 or config.gradient_steps >= 1, "must be -1 or at least 1")
+    freq = config.train_freq
+    demand("train_freq", freq == "episode" or (freq.isdecimal() and int(freq) >= 1), "must be steps or 'episode'")
+    demand("device", config.device == "cpu" or config.device.startswith("cuda"), "must be cpu or cuda")
+
+
+def differences(config: Config, base: Config) -> dict[str, object]:
+    """The settings of `config` that make it another experiment than `base`, seeds apart."""
+    names = [f.name for f in fields(Config) if f.name not in RUN_KEYS]
+    return {name: getattr(config, name) for name in names if getattr(config, name) != getattr(base, name)}

@@ -1,0 +1,50 @@
+"""Replay buffer: the last transitions of every seed, one row each, sampled with one gather."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from core.random import Streams
+
+
+class Batch(NamedTuple):
+    """Transitions (seeds, batch, features); the centres are None where the algorithm does not use any."""
+
+    obs: Tensor
+    action: Tensor
+    reward: Tensor  # (seeds, batch)
+    terminated: Tensor  # (seeds, batch): 1 where the episode ended for good; a time limit is no end
+    next_obs: Tensor
+    center: Tensor | None
+    next_center: Tensor | None
+
+
+class Replay:
+    """A ring of `capacity` transitions for each seed."""
+
+    def __init__(self, seeds: Sequence[int], capacity: int, obs_dim: int, action_dim: int, centers: bool, device: str):
+        self.capacity = capacity
+        self.widths = [obs_dim, action_dim, 1, 1, obs_dim] + [action_dim] * (2 if centers else 0)
+        self.rows = torch.empty(len(seeds) * capacity, sum(self.widths), device=device)
+        self.offsets = torch.arange(len(seeds)).unsqueeze(1) * capacity
+        self.added = [0] * len(seeds)
+        self.streams = Streams(seeds, "replay")
+
+    def add(self, which: Sequence[int], *columns: Tensor) -> None:
+        """Append one transition to each seed of `which`; `columns` (seeds, features) in the order of `Batch`."""
+        rows = torch.cat(columns, dim=-1)
+        for i in which:
+            self.rows[i * self.capacity + self.added[i] % self.capacity] = rows[i]
+            self.added[i] += 1
+
+    def sample(self, batch_size: int) -> Batch:
+        """`batch_size` transitions of every seed, uniform with replacement."""
+        sizes = [min(n, self.capacity) for n in self.added]
+        indices = self.streams.indices(sizes, batch_size) + self.offsets
+        rows = self.rows.index_select(0, indices.flatten().to(self.rows.device)).view(*indices.shape, -1)
+        obs, action, reward, terminated, next_obs, *centers = rows.split(self.widths, dim=-1)
+        return Batch(obs, action, reward[..., 0], terminated[..., 0], next_obs, *(centers or (None, None)))

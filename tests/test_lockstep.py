@@ -1,0 +1,97 @@
+"""Seeds trained in lockstep learn what each learns alone."""
+
+import pytest
+import torch
+
+import envs
+from algos import ALGORITHMS
+from core.replay import Replay
+from core.results import RunWriter
+from core.trainer import Trainer
+from run import plan
+
+
+class RecordingReplay(Replay):
+    """Keeps a checksum of every batch a seed was shown, and each seed's transitions."""
+
+    def sample(self, batch_size):
+        batch = super().sample(batch_size)
+        self.shown.append([float(batch.obs[i].double().sum()) for i in range(len(self.added))])
+        return batch
+
+
+def train(tmp_path, algo, env, seed, **settings):
+    """Train a short run; {seed: (parameters, transitions, gradient steps, batches)} and the trainer's episodes."""
+    settings = {"steps": 900, "learning_starts": 300, "batch_size": 16, "eval_every": 450} | settings
+    settings |= {"eval_episodes": 1, "final_episodes": 1, "hidden": "[32,32]"}
+    words = [f"algo={algo}", f"env={env}", f"seed={seed}", *(f"{k}={v}" for k, v in settings.items())]
+    ((config, _),) = plan(words)
+    seeds = [int(s) for s in str(seed).split(",")]
+    algorithm = ALGORITHMS[algo]
+    train_envs = [envs.make(env) for _ in seeds]
+    agent = algorithm.agent(
+        config,
+        envs.constraint(env),
+        train_envs[0].observation_space.shape[0],
+        seeds,
+        mapping=algorithm.mapping,
+        placement=algorithm.placement,
+    )
+    writers = [RunWriter(tmp_path / f"{algo}-{seed}" / f"seed={s}", {}, {}, 1) for s in seeds]
+    trainer = Trainer(config, agent, train_envs, lambda: envs.make(env), writers, progress=False)
+    trainer.replay.__class__ = RecordingReplay
+    trainer.replay.shown = []
+    results = trainer.run()
+    rows = trainer.replay.rows.view(len(seeds), trainer.replay.capacity, -1)
+    return {
+        s: {
+            "parameters": torch.load(writers[i].folder / "last.pt", weights_only=True),
+            "transitions": rows[i, : trainer.replay.added[i]],
+            "gradient_steps": results[i]["gradient_steps"],
+            "return": results[i]["return_mean"],
+            "batches": [shown[i] for shown in trainer.replay.shown][: results[i]["gradient_steps"]],
+        }
+        for i, s in enumerate(seeds)
+    }
+
+
+CASES = {
+    "TD3 on Reacher": ("DPre+", "R+O10", {}),
+    "SAC with gSDE": ("SRad", "R+M", {}),
+    "NFWPO": ("NFW", "R+L2", {}),
+    # Untrained walkers fall after 10 to 50 steps, each seed at times of its own; updates come once an episode.
+    "TD3 on Walker2d": ("DAlpha", "W+M", {}),
+    "SAC on Walker2d": ("SAlpha", "W+O+S", {"steps": 500}),
+}
+
+
+@pytest.mark.parametrize("algo, env, settings", CASES.values(), ids=CASES)
+def test_a_seed_learns_the_same_alone_and_among_others(tmp_path, algo, env, settings):
+    alone = train(tmp_path, algo, env, "3", **settings)[3]
+    together = train(tmp_path, algo, env, "1,3,8", **settings)
+    among = together[3]
+    assert among["gradient_steps"] == alone["gradient_steps"] >= 190
+    assert len(alone["transitions"]) == len(among["transitions"])
+    # The random numbers are the same bits, and so is the data until rounding of the weights reaches it.
+    assert torch.equal(alone["transitions"][:300], among["transitions"][:300])
+    torch.testing.assert_close(alone["transitions"], among["transitions"], rtol=0, atol=1e-3)
+    assert alone["batches"] == pytest.approx(among["batches"], abs=1e-2)
+    for name, parameter in alone["parameters"].items():
+        torch.testing.assert_close(parameter, among["parameters"][name], rtol=0, atol=1e-4, msg=name)
+    # Neighbours are other seeds, not copies.
+    assert not torch.equal(together[1]["transitions"][:300], among["transitions"][:300])
+    if env.startswith("W"):
+        assert len({together[s]["gradient_steps"] for s in together}) > 1 or "SAlpha" in algo
+
+
+def test_different_seeds_start_from_different_networks(tmp_path):
+    runs = train(tmp_path, "DPre", "R+N", "0,1", steps=10, learning_starts=10, eval_every=10)
+    first, second = (runs[s]["parameters"]["actor.layers.0.weight"] for s in (0, 1))
+    assert not torch.equal(first, second)
+
+
+def test_the_same_seed_twice_gives_the_same_bits(tmp_path):
+    one = train(tmp_path / "a", "SPre", "R+T", "5", steps=400, learning_starts=200)[5]
+    two = train(tmp_path / "b", "SPre", "R+T", "5", steps=400, learning_starts=200)[5]
+    assert torch.equal(one["transitions"], two["transitions"])
+    assert all(torch.equal(p, two["parameters"][name]) for name, p in one["parameters"].items())

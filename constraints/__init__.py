@@ -1,0 +1,18 @@
+"""Feasible action sets and differentiable maps onto them; usable on their own."""
+
+from constraints.base import Constraint
+from constraints.box import Box
+from constraints.ellipse import DiagonalEllipse, PlanarEllipse
+from constraints.l1_and_ellipse import WeightedL1AndEllipse
+from constraints.weighted import HalfSpace, WeightedL1, WeightedPositivePart
+
+__all__ = [
+    "Box",
+    "Constraint",
+    "DiagonalEllipse",
+    "HalfSpace",
+    "PlanarEllipse",
+    "WeightedL1",
+    "WeightedL1AndEllipse",
+    "WeightedPositivePart",
+]

@@ -1,0 +1,28 @@
+"""The action box alone (R+N)."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from constraints.base import Constraint, JacobianProduct, box_gauge_gradient, deflated_jacobian, largest_gauge
+
+
+class Box(Constraint):
+    """The box [-1, 1]^dim."""
+
+    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
+        return action.abs().amax(-1) - 1.0
+
+    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
+        return 0.0 * action.sum(-1)  # keeps the autograd graph that a training loss expects
+
+    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        return action.clamp(-1.0, 1.0), deflated_jacobian((action.abs() < 1.0).double())
+
+    def _gauge_and_gradient(
+        self, obs: Tensor, direction: Tensor, center: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        return largest_gauge(direction, box_gauge_gradient(direction, center))
+
+    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
+        return gradient.sign()

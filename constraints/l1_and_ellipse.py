@@ -1,0 +1,65 @@
+"""Weighted L1 ball and diagonal ellipse at once (H+O+S, W+O+S)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from constraints.base import (
+    Coefficients,
+    Constraint,
+    JacobianProduct,
+    box_gauge_gradient,
+    deflated_jacobian,
+    largest_gauge,
+)
+from constraints.ellipse import DiagonalEllipse
+from constraints.separable import minimize_under_ellipse, minimize_under_row
+from constraints.weighted import WeightedL1, row_free
+
+
+class WeightedL1AndEllipse(Constraint):
+    """sum |w_i a_i| <= weight_bound and sum s_i a_i^2 <= scale_bound in the box.
+
+    Projection and oracle have two multipliers: the row's is exact for each value of the ellipse's.
+    """
+
+    def __init__(
+        self, weight: Coefficients, weight_bound: float, scale: Coefficients, scale_bound: float, dim: int
+    ):
+        super().__init__(dim)
+        self.l1 = WeightedL1(weight, weight_bound, dim)
+        self.ellipse = DiagonalEllipse(scale, scale_bound, dim)
+
+    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
+        return torch.maximum(self.l1._violation(obs, action), self.ellipse._violation(obs, action))
+
+    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
+        return self.l1._penalty(obs, action) + self.ellipse._penalty(obs, action)
+
+    def _solve(self, obs: Tensor, target: Tensor, shift: float):
+        weight, bound = self.l1.scaled_weight(obs)
+        row, low, high = self.l1._orthant(weight, target)
+
+        def under_row(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            solution, active = minimize_under_row(target, metric, row, bound, low, high)
+            return solution, row_free(solution, row, active, low, high), row * active
+
+        return minimize_under_ellipse(under_row, target, shift, self.ellipse.scale(obs), self.ellipse.bound)
+
+    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        solution, curvature, normals = self._solve(obs, action, 1.0)
+        return self._pull_in(obs, solution), deflated_jacobian(curvature, *normals)
+
+    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
+        return self._pull_in(obs, self._solve(obs, gradient, 0.0)[0])
+
+    def _gauge_and_gradient(
+        self, obs: Tensor, direction: Tensor, center: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        return largest_gauge(
+            direction,
+            box_gauge_gradient(direction, center),
+            self.l1.gauge_gradient(obs, direction, center),
+            self.ellipse.gauge_gradient(obs, direction, center),
+        )

@@ -1,0 +1,176 @@
+"""Linear sets whose rows are sign or subset patterns of one weight vector.
+
+The sets have 2^d, 2^d - 1 and 1 rows, but within the orthant of a given point only one of them matters: projection and
+oracle are one scalar dual problem (`minimize_under_row`), and the gauge needs the one row that the ray meets.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+
+import torch
+from torch import Tensor
+
+from constraints.base import (
+    Coefficients,
+    Constraint,
+    JacobianProduct,
+    box_gauge_gradient,
+    deflated_jacobian,
+    largest_gauge,
+    safe_sqrt,
+)
+from constraints.separable import minimize_under_row
+
+
+class _WeightPatterns(Constraint):
+    """Rows pattern_k * weight(obs), all with the same bound > 0."""
+
+    def __init__(self, weight: Coefficients, bound: float, dim: int):
+        super().__init__(dim)
+        if bound <= 0.0:
+            raise ValueError(f"bound must be positive for the origin to be interior, got {bound}")
+        self.weight = weight
+        self.bound = bound
+
+    def _patterns(self, device: torch.device) -> Tensor:
+        """The rows' patterns (m, d), entries in {-1, 0, 1}."""
+        raise NotImplementedError
+
+    def _row(self, weight: Tensor, side: Tensor) -> Tensor:
+        """The row (..., d) with the largest value in the orthant `side` (..., d), entries in {-1, 0, 1}."""
+        raise NotImplementedError
+
+    def _orthant(self, weight: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Row and range (low, high) that hold the projection of `point`, or the oracle's answer for it.
+
+        Neither crosses 0: the constraint never asks for the opposite sign.
+        """
+        side = torch.where(point < 0.0, -1.0, 1.0)
+        return self._row(weight, side), (side - 1.0) / 2.0, (side + 1.0) / 2.0
+
+    def scaled_weight(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Weight (..., d) and bound (..., 1) divided by the largest |weight|, which may be 0 or 1e6."""
+        weight = self.weight(obs)
+        scale = weight.abs().amax(-1, keepdim=True)
+        scale = torch.where(scale > 0.0, scale, 1.0)
+        return weight / scale, self.bound / scale
+
+    def _excess(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Ax - b (..., m) with unit rows; a zero row stays as it is."""
+        weight = self.weight(obs)
+        patterns = self._patterns(action.device)
+        norm = (weight**2 @ (patterns**2).T).sqrt()
+        return ((weight * action) @ patterns.T - self.bound) / torch.where(norm > 0.0, norm, 1.0)
+
+    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
+        return self._excess(obs, action).amax(-1)
+
+    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
+        return safe_sqrt(self._excess(obs, action).clamp(min=0.0).square().sum(-1))
+
+    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        weight, bound = self.scaled_weight(obs)
+        row, low, high = self._orthant(weight, action)
+        solution, active = minimize_under_row(action, torch.ones_like(action), row, bound, low, high)
+        free = row_free(solution, row, active, low, high)
+        return self._pull_in(obs, solution), deflated_jacobian(free, row * active)
+
+    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
+        weight, bound = self.scaled_weight(obs)
+        row, low, high = self._orthant(weight, gradient)
+        solution, _ = minimize_under_row(gradient, torch.zeros_like(gradient), row, bound, low, high)
+        return self._pull_in(obs, solution)
+
+    def gauge_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
+        """Gradient (..., d) of the gauge of these rows, the box left out."""
+        weight, bound = self.scaled_weight(obs)
+        direction = direction.detach()
+        if center is None:
+            return self._row(weight, direction.sign()) / bound
+        # Along center + t direction the largest row value is convex and starts below the bound; its row changes only
+        # where a coordinate crosses 0. The row that reaches the bound is the one after the last crossing below it.
+        turns = center * direction < 0.0
+        crossing = torch.where(turns, -center / torch.where(turns, direction, 1.0), 0.0).clamp(max=1e300)
+        point = center.unsqueeze(-2) + crossing.unsqueeze(-1) * direction.unsqueeze(-2)
+        value = (self._row(weight.unsqueeze(-2), point.sign()) * point).sum(-1)
+        last = torch.where(value <= bound, crossing, 0.0).amax(-1, keepdim=True)
+        before = torch.where(center == 0.0, direction, center).sign()
+        side = torch.where(turns & (crossing <= last), direction.sign(), before)
+        row = self._row(weight, side)
+        return row / (bound - (row * center).sum(-1, keepdim=True))
+
+    def _gauge_and_gradient(
+        self, obs: Tensor, direction: Tensor, center: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        return largest_gauge(
+            direction, box_gauge_gradient(direction, center), self.gauge_gradient(obs, direction, center)
+        )
+
+
+class WeightedL1(_WeightPatterns):
+    """sum |w_i a_i| <= bound in the box: 2^d rows (R+O03, R+O10, R+O30, HC+O)."""
+
+    def _patterns(self, device: torch.device) -> Tensor:
+        return _patterns((-1.0, 1.0), self.dim, device)
+
+    def _row(self, weight: Tensor, side: Tensor) -> Tensor:
+        return weight.abs() * side
+
+
+class WeightedPositivePart(_WeightPatterns):
+    """sum max(w_i a_i, 0) <= bound in the box: 2^d - 1 rows (R+M, H+M, W+M)."""
+
+    origin_centered = False
+
+    def _patterns(self, device: torch.device) -> Tensor:
+        return _patterns((0.0, 1.0), self.dim, device)[1:]
+
+    def _row(self, weight: Tensor, side: Tensor) -> Tensor:
+        return weight * (weight * side > 0.0)
+
+    def _center(self, obs: Tensor) -> Tensor:
+        # Of all subsets' rows, prefixes of the weights sorted downwards limit the radius. Many points attain it; this
+        # one is continuous in obs.
+        weight, bound = self.scaled_weight(obs)
+        ordered = weight.abs().sort(-1, descending=True).values
+        total, norm = ordered.cumsum(-1), ordered.square().cumsum(-1).sqrt()
+        radius = ((bound + total) / (norm + total)).amin(-1, keepdim=True).clamp(max=1.0)
+        room = 1.0 - radius
+        return -(radius**2 * weight / (2.0 * bound)).clamp(-room, room)
+
+
+class HalfSpace(_WeightPatterns):
+    """weight.a <= bound in the box: one row (HC+MA)."""
+
+    origin_centered = False
+
+    def _patterns(self, device: torch.device) -> Tensor:
+        return torch.ones(1, self.dim, dtype=torch.float64, device=device)
+
+    def _row(self, weight: Tensor, side: Tensor) -> Tensor:
+        return weight.expand(torch.broadcast_shapes(weight.shape, side.shape))
+
+    def _orthant(self, weight: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        one = torch.ones_like(point)
+        return self._row(weight, point), -one, one
+
+    def _center(self, obs: Tensor) -> Tensor:
+        weight, bound = self.scaled_weight(obs)
+        total, norm = weight.abs().sum(-1, keepdim=True), weight.norm(dim=-1, keepdim=True)
+        radius = ((bound + total) / (norm + total)).clamp(max=1.0)
+        return -(1.0 - radius) * weight.sign()
+
+
+def row_free(solution: Tensor, row: Tensor, active: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """1.0 where a coordinate of a projection is free to move (..., d), 0.0 at the box or at an active kink."""
+    held = active & (row != 0.0)
+    inside = torch.where(held, (solution > low) & (solution < high), solution.abs() < 1.0)
+    return inside.double()
+
+
+@functools.lru_cache
+def _patterns(entries: tuple[float, float], dim: int, device: torch.device) -> Tensor:
+    rows = list(itertools.product(entries, repeat=dim))
+    return torch.tensor(rows, dtype=torch.float64, device=device)

@@ -157,13 +157,11 @@ def learning_curve(runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray, np.ndar
     """Steps, mean over the seeds evaluated there, standard error (NaN with one seed); each of shape (n,)."""
     steps = np.unique(np.concatenate([run.evaluations.step for run in runs]))
     # Masked where a seed has no evaluation (yet); a return of NaN stays NaN and breaks the line.
-    values = np.ma.masked_all((len(runs), len(steps)))
+    values = np.ma.array(np.zeros((len(runs), len(steps))), mask=True)
     for row, run in zip(values, runs, strict=True):
         row[np.searchsorted(steps, run.evaluations.step)] = run.evaluations.return_mean
-    count = values.count(axis=0)
-    deviation = (((values - values.mean(axis=0)) ** 2).sum(axis=0) / np.maximum(count - 1, 1)) ** 0.5
-    error = np.where(count > 1, deviation.filled(math.nan) / np.sqrt(count), math.nan)
-    return steps, values.mean(axis=0).filled(math.nan), error
+    error = values.std(axis=0, ddof=1) / np.sqrt(values.count(axis=0))
+    return steps, values.mean(axis=0).filled(math.nan), error.filled(math.nan)
 
 
 def read_paper() -> dict[tuple[str, str, str], Statistic]:
@@ -244,7 +242,8 @@ def _lines(stat: Statistic, digits: int) -> tuple[str, ...]:
 def comparison_table(statistics: dict[Condition, dict[str, Statistic]]) -> Table:
     """Ours beside the paper's, for the cells that the paper has.
 
-    Of the settings only the batch size chooses the paper's row; runs with others are compared too, as labelled.
+    Of the settings only the batch size chooses the paper's row; runs with others are compared too, as
+    labelled.
     """
     paper = read_paper()
     sections, records = [], []
@@ -354,8 +353,11 @@ def to_latex(table: Table) -> str:
     body.append(line([text(head) for head in table.header]))
     for section in table.sections:
         body.append(r"\midrule")
-        for row in section:
-            for i in range(max(len(cell.lines) for cell in row)):
+        for number, row in enumerate(section):
+            height = max(len(cell.lines) for cell in row)
+            if number and height > 1:
+                body.append(r"\addlinespace")
+            for i in range(height):
                 texts = [text(cell.lines[i]) if i < len(cell.lines) else "" for cell in row]
                 emphasis = [cell.bold and i == 0 for cell in row]
                 body.append(
@@ -384,7 +386,7 @@ def list_unfinished(groups: Groups) -> list[str]:
                 span = " to ".join(f"{step:,}" for step in sorted({min(reached), max(reached)}))
                 seeds = ", ".join(str(run.seed) for run in runs)
                 total = runs[0].config.get("steps")
-                of = f" of {total:,}" if total else ""
+                of = f" of {total:,}" if isinstance(total, int) else ""
                 lines.append(f"{condition.label} {algo}: seed {seeds}, evaluated to step {span}{of}")
     return lines
 
@@ -444,7 +446,7 @@ def write_figures(groups: Groups, folder: Path, formats: Sequence[str]) -> list[
             )
         axes.set_title(condition.label)
         axes.set_xlabel("Environment steps")
-        axes.set_ylabel("Evaluation return")
+        axes.set_ylabel("Evaluation return (mean ± standard error)")
         axes.set_xlim(left=0)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(alpha=0.3)

@@ -1,0 +1,519 @@
+"""Run folders (core/results.py), and the tables and figures made from them (plot.py)."""
+
+import csv
+import io
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+import plot
+from core import results
+
+ROOT = Path(__file__).parents[1]
+STEPS = 20_000
+
+# (task, batch): sum of the means, sum of the standard errors, best three as printed in bold in the paper.
+PAPER_ROWS = {
+    ("R+N", "default"): (122.87, 3.60, {"NFW", "SPre", "SRad"}),
+    ("R+L2", "default"): (210.90, 7.61, {"DPre+", "NFW", "SPre+"}),
+    ("R+O03", "default"): (235.92, 4.34, {"NFW", "SPre", "SRad"}),
+    ("R+O10", "default"): (234.09, 4.47, {"NFW", "SPre+", "SRad"}),
+    ("R+O30", "default"): (225.34, 5.73, {"NFW", "SPre", "SPre+"}),
+    ("R+M", "default"): (232.01, 5.74, {"NFW", "SPre+", "SRad"}),
+    ("R+T", "default"): (156.80, 9.06, {"DPro+", "DPre+", "SPre+"}),
+    ("HC+O", "default"): (90636, 3365, {"SPre", "SPre+", "SAlpha"}),
+    ("HC+MA", "default"): (104884, 3368, {"SPre", "SPre+", "SAlpha"}),
+    ("H+M", "default"): (35838, 453, {"DPre", "NFW", "DRad"}),
+    ("H+O+S", "default"): (30384, 1373, {"DPre+", "DAlpha", "SRad"}),
+    ("W+M", "default"): (46025, 1618, {"DPro+", "DPre+", "SPre+"}),
+    ("W+O+S", "default"): (36121, 1100, {"DPre+", "SPre+", "SAlpha"}),
+    ("HC+O", "16"): (87336, 4008, {"SPre", "SAlpha", "SRad"}),
+    ("H+M", "16"): (41840, 671, {"DOpt+", "DAlpha", "SPre"}),
+    ("W+M", "16"): (43790, 2864, {"DPre+", "DRad", "SAlpha"}),
+}
+
+
+def write_run(root, task, algo, seed, result=None, overrides=None, evaluations=4, base=0.0, **config):
+    """A run with `evaluations` evaluations, finished with the mean return `result` unless that is None."""
+    overrides = overrides or {}
+    folder = results.run_folder(root, task, results.variant_name(algo, overrides), seed)
+    settings = {
+        "algo": algo,
+        "env": task,
+        "seed": str(seed),
+        "steps": STEPS,
+        "gamma": 0.99,
+        **overrides,
+        **config,
+    }
+    writer = results.RunWriter(folder, settings, {"commit": None}, eval_episodes=3)
+    rng = np.random.default_rng(seed)
+    for step in range(5_000, 5_000 * evaluations + 1, 5_000):
+        writer.append_evaluation(step, base + step / 1_000 + rng.normal(size=3), step / 100)
+    if result is not None:
+        writer.finish({"return_mean": result, "returns": [result] * 50})
+    return writer
+
+
+def records(root, table):
+    with open(Path(root, "tables", f"{table}.csv"), newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def fails(capsys, *arguments):
+    """The one line with which plot.py refuses `arguments`."""
+    assert plot.main([str(argument) for argument in arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert "Traceback" not in captured.err
+    return captured.err
+
+
+# ---- run folders ----
+
+
+def test_round_trip(tmp_path):
+    folder = results.run_folder(tmp_path, "W+M", results.variant_name("SRad", {"steps": 50_000}), 3)
+    config = {
+        "algo": "SRad",
+        "learning_rate": 1e-5,
+        "hidden": [256, 256],
+        "gsde": False,
+        "action_noise": None,
+    }
+    writer = results.RunWriter(folder, config, {"commit": "abc"}, eval_episodes=2)
+    unfinished = results.read_run(folder)
+    assert not unfinished.finished and unfinished.result is None
+    assert unfinished.evaluations.returns.shape == (0, 2)
+
+    returns = np.array([[0.1, -2.0], [1 / 3, np.float32(7.7)]])
+    writer.append_evaluation(5_000, returns[0], 1.5)
+    writer.append_evaluation(10_000, list(returns[1]), 3.25)
+    weights = {"weight": torch.arange(6.0).reshape(2, 3)}
+    writer.save_parameters("best", weights)
+    writer.save_parameters("last", {"weight": torch.zeros(1)})
+    writer.save_parameters("last", weights)
+    assert not results.is_finished(folder)
+    writer.finish({"return_mean": np.float32(2.5), "returns": np.ones(2), "best_step": torch.tensor(5_000)})
+    assert results.is_finished(folder)
+
+    run = results.read_run(folder)
+    assert folder == tmp_path / "W+M" / "SRad,steps=50000" / "seed=3"
+    assert (run.task, run.algo, run.variant, run.seed) == ("W+M", "SRad", "SRad,steps=50000", 3)
+    assert run.overrides == {"steps": "50000"} and run.config == config
+    assert run.finished and run.result == {"return_mean": 2.5, "returns": [1.0, 1.0], "best_step": 5_000}
+    assert run.evaluations.step.tolist() == [5_000, 10_000]
+    np.testing.assert_array_equal(run.evaluations.returns, returns)
+    np.testing.assert_allclose(run.evaluations.return_mean, returns.mean(axis=1), rtol=1e-15)
+    assert run.evaluations.seconds.tolist() == [1.5, 3.25]
+    for name in ("best", "last"):
+        torch.testing.assert_close(torch.load(folder / f"{name}.pt", weights_only=True), weights)
+    files = {"config.yaml", "info.json", "evaluations.csv", "best.pt", "last.pt", "result.json"}
+    assert {path.name for path in folder.iterdir()} == files
+
+
+def test_variant_names():
+    overrides = {
+        "steps": 50_000,
+        "hidden": [64, 32],
+        "gsde": True,
+        "learning_rate": 1e-4,
+        "train_freq": "episode",
+    }
+    name = results.variant_name("DPre+", overrides)
+    assert name == "DPre+,gsde=true,hidden=[64,32],learning_rate=0.0001,steps=50000,train_freq=episode"
+    algo, settings = results.parse_variant(name)
+    assert algo == "DPre+" and results.variant_name(algo, settings) == name
+    assert settings["hidden"] == "[64,32]"
+    assert results.parse_variant("NFW") == ("NFW", {})
+    for task, variant in (("a/b", "SRad"), ("R+N", "SRad,x=/tmp"), ("..", "SRad"), ("R+N", "")):
+        with pytest.raises(ValueError, match="cannot name"):
+            results.run_folder("results", task, variant, 0)
+
+
+def test_earlier_runs_are_moved_aside_and_never_lost(tmp_path):
+    first = write_run(tmp_path, "R+N", "SRad", 3, evaluations=1)
+    write_run(tmp_path, "R+N", "SRad", 3, evaluations=2)
+    write_run(tmp_path, "R+N", "SRad", 3, evaluations=3, result=1.0)
+    with pytest.raises(FileExistsError, match="finished"):
+        write_run(tmp_path, "R+N", "SRad", 3)
+    results.RunWriter(first.folder, {"algo": "SRad"}, {}, 3, replace_finished=True)
+
+    aside = [first.folder.with_name(f"seed=3.old-{i}") for i in (1, 2, 3)]
+    assert [len(results._read_evaluations(old / "evaluations.csv").step) for old in aside] == [1, 2, 3]
+    assert results.is_finished(aside[2]) and not results.is_finished(first.folder)
+    assert results.find_runs(tmp_path) == [first.folder]
+
+
+def test_a_death_while_writing_leaves_the_old_file_or_none(tmp_path, monkeypatch):
+    writer = write_run(tmp_path, "R+N", "SRad", 0)
+    writer.save_parameters("best", {"weight": torch.ones(2)})
+
+    def die(descriptor):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", die)
+        with pytest.raises(KeyboardInterrupt):
+            writer.save_parameters("best", {"weight": torch.zeros(2)})
+        with pytest.raises(KeyboardInterrupt):
+            writer.finish({"return_mean": 1.0})
+    assert torch.load(writer.folder / "best.pt")["weight"].tolist() == [1.0, 1.0]
+    assert not results.is_finished(writer.folder)
+    writer.finish({"return_mean": 1.0})
+    assert results.read_run(writer.folder).result == {"return_mean": 1.0}
+
+
+def test_the_writer_refuses_what_it_could_not_read_back(tmp_path):
+    writer = write_run(tmp_path, "R+N", "SRad", 0)
+    with pytest.raises(ValueError, match="3 returns"):
+        writer.append_evaluation(25_000, [1.0, 2.0], 1.0)
+    with pytest.raises(ValueError, match="best"):
+        writer.save_parameters("final", {})
+    assert len(results.read_run(writer.folder).evaluations.step) == 4
+
+
+@pytest.mark.parametrize("torn", ["25000", "25000,1.0,1.0,1.0,1.0,25", "25000,1.0,1."])
+def test_a_row_being_written_is_not_read(tmp_path, torn):
+    folder = write_run(tmp_path, "R+N", "SRad", 0).folder
+    with open(folder / "evaluations.csv", "a") as file:
+        file.write(torn)
+    assert results.read_run(folder).evaluations.step.tolist() == [5_000, 10_000, 15_000, 20_000]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("evaluations.csv", b"step,return_mean,return_1,seconds\n5000,1.0\n"),
+        ("evaluations.csv", b"step,return_mean,return_1,seconds\n5000,1.0,what,2\n"),
+        ("evaluations.csv", b""),
+        ("evaluations.csv", b"\xff\xfe\x00"),
+        ("config.yaml", b"a: [1, 2"),
+        ("config.yaml", b"just text"),
+        ("config.yaml", None),
+        ("result.json", b'{"return_mean": 1'),
+        ("result.json", b'{"returns": []}'),
+    ],
+)
+def test_corrupt_files_are_named_and_their_runs_skipped(tmp_path, capsys, name, content):
+    write_run(tmp_path, "R+N", "SRad", 0, result=10.0)
+    path = write_run(tmp_path, "R+N", "SRad", 1, result=20.0).folder / name
+    path.unlink() if content is None else path.write_bytes(content)
+
+    runs, problems = results.read_results(tmp_path)
+    assert [run.seed for run in runs] == [0]
+    assert len(problems) == 1 and problems[0].startswith(f"{path}: ") and "\n" not in problems[0]
+
+    assert plot.main([str(tmp_path), "format=csv"]) == 0
+    assert f"skipped {path}" in capsys.readouterr().err
+    assert [(row["mean"], row["n"]) for row in records(tmp_path, "rewards")] == [("10.0", "1")]
+
+
+def test_description_of_the_environment(monkeypatch):
+    command = ["/home/someone/repository/run.py", "algo=SRad", "results=/data/runs", "seed=0-9"]
+    info = results.describe_environment(command)
+    assert info["command"] == "run.py algo=SRad results=runs seed=0-9"
+    assert info["versions"]["torch"] == torch.__version__
+    assert info["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", info["started"])
+    assert str(Path.home()) not in json.dumps(info) and str(ROOT) not in json.dumps(info)
+
+    monkeypatch.setenv("PATH", "")
+    without_git = results.describe_environment(command)
+    assert without_git["commit"] is None and without_git["dirty"] is None
+
+
+def test_description_names_the_commit(tmp_path, monkeypatch):
+    def git(*arguments):
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+        command = ["git", "-C", str(tmp_path), *identity, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    code = tmp_path / "results.py"
+    code.write_text("first\n")
+    monkeypatch.setattr(results, "__file__", str(code))
+    git("init")
+    assert results.describe_environment([])["commit"] is None  # not a file of that repository
+    git("add", ".")
+    git("commit", "-m", "first", "--no-verify")
+    git("tag", "-a", "v1", "-m", "a tag is not a commit's name")
+    info = results.describe_environment([])
+    assert info["commit"] == git("rev-parse", "HEAD") and info["dirty"] is False
+    code.write_text("second\n")
+    info = results.describe_environment([])
+    assert info["commit"] == git("rev-parse", "HEAD") and info["dirty"] is True
+
+
+# ---- statistics ----
+
+
+def test_statistics_against_scipy():
+    values = np.random.default_rng(0).normal(5, 3, size=10)
+    stat = plot.statistic(values)
+    assert stat.n == 10
+    np.testing.assert_allclose([stat.mean, stat.se], [stats.tmean(values), stats.sem(values)], rtol=1e-12)
+    alone = plot.statistic([3.0])
+    assert alone.mean == 3.0 and math.isnan(alone.se) and alone.n == 1
+
+
+def test_learning_curve_averages_over_the_seeds_that_are_there(tmp_path):
+    lengths = [4, 4, 3, 1]
+    for seed, length in enumerate(lengths):
+        write_run(tmp_path, "R+N", "SRad", seed, evaluations=length)
+    runs, _ = results.read_results(tmp_path)
+    steps, mean, error = plot.learning_curve(runs)
+    values = np.full((4, 4), np.nan)
+    for row, run in zip(values, runs, strict=True):
+        row[: len(run.evaluations.step)] = run.evaluations.return_mean
+    assert steps.tolist() == [5_000, 10_000, 15_000, 20_000]
+    np.testing.assert_allclose(mean, np.nanmean(values, axis=0), rtol=1e-12)
+    np.testing.assert_allclose(error, stats.sem(values, axis=0, nan_policy="omit"), rtol=1e-12)
+
+    steps, mean, error = plot.learning_curve(runs[:1])
+    np.testing.assert_array_equal(mean, runs[0].evaluations.return_mean)
+    assert np.isnan(error).all()
+
+
+def test_a_diverged_seed_is_not_averaged_away(tmp_path):
+    write_run(tmp_path, "R+N", "SRad", 0)
+    write_run(tmp_path, "R+N", "SRad", 1).append_evaluation(25_000, [math.nan] * 3, 1.0)
+    runs, _ = results.read_results(tmp_path)
+    _, mean, _ = plot.learning_curve(runs)
+    assert math.isnan(mean[-1]) and np.isfinite(mean[:-1]).all()
+
+
+def test_best_three():
+    assert plot.best_three({"a": 1.0, "b": 4.0, "c": 3.0, "d": 2.0}) == {"b", "c", "d"}
+    assert plot.best_three({"a": -1.0, "b": -4.0, "c": -3.0, "d": -2.0}) == {"a", "d", "c"}
+    assert plot.best_three({"a": 1.0, "b": 4.0, "c": 3.0, "d": 1.0}) == {"a", "b", "c", "d"}  # tied third
+    assert plot.best_three({"a": math.nan, "b": 1.0}) == {"b"}
+    assert plot.best_three({"a": math.nan}) == set()
+
+
+def test_the_papers_table_is_typed_right():
+    paper = plot.read_paper()
+    assert len(paper) == 188
+    assert {algo for _, _, algo in paper} == set(plot.COLORS)
+    assert list(dict.fromkeys((task, batch) for task, batch, _ in paper)) == list(PAPER_ROWS)
+    for (task, batch), (means, errors, bold) in PAPER_ROWS.items():
+        row = {algo: stat for (t, b, algo), stat in paper.items() if (t, b) == (task, batch)}
+        assert sum(stat.mean for stat in row.values()) == pytest.approx(means, abs=1e-9)
+        assert sum(stat.se for stat in row.values()) == pytest.approx(errors, abs=1e-9)
+        assert plot.best_three({algo: stat.mean for algo, stat in row.items()}) == bold
+    assert paper["R+L2", "default", "DPro"][:2] == (-4.65, 0.59)
+    assert paper["HC+O", "16", "SRad"][:2] == (7459, 169)
+
+
+# ---- tables and figures ----
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    """Results as they look in the middle of the work, already plotted; the folder and what was printed."""
+    root = tmp_path_factory.mktemp("results")
+    for seed in range(10):
+        write_run(root, "R+L2", "DPro", seed, result=-5.0 + 0.1 * seed)
+    for algo, value in (("SRad", 15.0), ("DOpt", 19.0), ("NFW", 19.5), ("Mine", 12.0)):
+        for seed in range(3):
+            write_run(root, "R+L2", algo, seed, result=value + 0.1 * seed)
+    write_run(root, "R+L2", "SRad", 3, evaluations=2)
+    write_run(root, "R+L2", "SRad", 4, evaluations=0)
+    write_run(root, "R+N", "DPro", 0, result=17.0)
+    write_run(root, "W+M", "DRad", 0, result=4000.0, overrides={"batch_size": 16})
+    write_run(root, "W+M", "DRad", 0, result=4400.0)
+    write_run(root, "X+Y", "DRad", 0, evaluations=1)
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", printed)
+        assert plot.main([str(root)]) == 0
+    return root, printed.getvalue()
+
+
+def test_reward_records(mixed):
+    root, _ = mixed
+    cells = {(r["task"], r["settings"], r["algo"]): r for r in records(root, "rewards")}
+    assert set(cells) == {
+        *(("R+L2", "", algo) for algo in ("DPro", "DOpt", "NFW", "SRad", "Mine")),
+        ("R+N", "", "DPro"),
+        ("W+M", "", "DRad"),
+        ("W+M", "batch_size=16", "DRad"),
+    }
+    dpro = cells["R+L2", "", "DPro"]
+    returns = [-5.0 + 0.1 * seed for seed in range(10)]
+    assert float(dpro["mean"]) == pytest.approx(np.mean(returns))
+    assert float(dpro["se"]) == pytest.approx(stats.sem(returns))
+    assert (dpro["n"], dpro["best_three"]) == ("10", "0")
+    assert (cells["R+L2", "", "SRad"]["n"], cells["R+L2", "", "SRad"]["best_three"]) == ("3", "1")
+    assert cells["R+L2", "", "Mine"]["best_three"] == "0"
+    assert float(cells["W+M", "batch_size=16", "DRad"]["mean"]) == 4000
+
+
+def test_markdown(mixed):
+    root, _ = mixed
+    text = (root / "tables" / "rewards.md").read_text()
+    rows = [
+        [cell.strip() for cell in line.strip("|\n").split("|")] for line in text.splitlines() if "|" in line
+    ]
+    assert rows[0] == ["Condition", *plot.COLORS, "Mine"]
+    row = dict(zip(rows[0], rows[3], strict=True))
+    assert [r[0] for r in rows[2:]] == ["R+N", "R+L2", "W+M", "W+M batch_size=16"]
+    assert row["DPro"] == "-4.55 ± 0.10"
+    assert row["NFW"] == "**19.60** ± 0.06 n=3"
+    assert row["SRad"] == "**15.10** ± 0.06 n=3"
+    assert row["Mine"] == "12.10 ± 0.06 n=3"
+    assert row["DPre"] == "–"
+    unconstrained = dict(zip(rows[0], rows[2], strict=True))
+    assert (unconstrained["DPro"], unconstrained["DOpt+"]) == ("**17.00** n=1", "as DPro")
+    assert (unconstrained["NFW"], unconstrained["SPre+"]) == ("–", "–")
+    assert "R+L2 SRad: seed 3, 4, evaluated to step 0 to 10,000 of 20,000" in text
+    assert "X+Y DRad: seed 0, evaluated to step 5,000 of 20,000" in text
+
+
+def test_comparison_with_the_paper(mixed):
+    root, printed = mixed
+    cells = {(r["task"], r["settings"], r["algo"]): r for r in records(root, "comparison")}
+    nfw = cells["R+L2", "", "NFW"]
+    assert (nfw["paper_mean"], nfw["paper_se"]) == ("19.7", "0.33")
+    assert float(nfw["difference"]) == pytest.approx(19.6 - 19.7)
+    assert float(nfw["joint_errors"]) == pytest.approx(-0.1 / math.hypot(0.33, stats.sem([19.5, 19.6, 19.7])))
+    assert cells["W+M", "batch_size=16", "DRad"]["paper_mean"] == "4013.0"
+    assert cells["W+M", "", "DRad"]["paper_mean"] == "4341.0"
+    assert ("R+L2", "", "Mine") not in cells
+    assert re.search(r"R\+N +DPro +17\.00 n=1 +17\.57 ± 0\.27 +-0\.57 +–", printed)
+    assert re.search(r"R\+L2 +DPro +-4\.55 ± 0\.10 +-4\.65 ± 0\.59 +\+0\.10 +\+0\.2", printed)
+
+
+def test_terminal(mixed):
+    _, printed = mixed
+    assert "\x1b" not in printed  # not a terminal
+    assert "R+L2 SRad: seed 3, 4" in printed
+    table = printed[printed.index("Rewards:") :]
+    header = next(line for line in table.splitlines() if line.startswith("Condition"))
+    assert header.split() == ["Condition", "DPro", "DOpt", "NFW", "DRad", "SRad", "Mine"]
+    assert "tables" in printed.splitlines()[-2] and "figures" in printed.splitlines()[-1]
+
+
+def test_terminal_wraps_and_prints_bold(mixed):
+    root, _ = mixed
+    runs, _ = results.read_results(root)
+    table = plot.reward_table(plot.reward_statistics(plot.group_runs(runs)))
+    narrow = plot.to_terminal(table, bold=True, width=40)
+    plain = re.sub(r"\x1b\[\d?m", "", narrow)
+    assert max(map(len, plain.splitlines()[1:])) <= 40
+    assert all(algo in plain for algo in ("DPro", "DOpt", "NFW", "DRad", "SRad", "Mine"))
+    bold = [text.strip() for text in re.findall(r"\x1b\[1m(.*?)\x1b\[0m", narrow)]
+    assert sorted(bold) == sorted(["17.00", "19.60", "19.10", "15.10", "4400", "4000"])
+
+
+def test_latex(mixed):
+    root, _ = mixed
+    text = (root / "tables" / "rewards.tex").read_text()
+    assert text.count(r"\begin") == text.count(r"\end") == 2
+    body = text[text.index("Condition &") : text.index(r"\bottomrule")]
+    rows = [line for line in body.splitlines() if line.endswith(r"\\")]
+    assert {line.count("&") for line in rows} == {14}
+    assert r"\textbf{19.60}" in body and r"$\pm$ 0.06" in body and "$-$4.55" in body
+    assert r"batch\_size=16" in body and "±" not in body and "–" not in body
+    assert r"\multicolumn{9}{c}{TD3 family} & \multicolumn{4}{c}{SAC family}" in text
+
+
+def test_figures(mixed):
+    root, _ = mixed
+    names = ["R+L2", "R+N", "W+M", "W+M,batch_size=16", "X+Y"]
+    files = sorted(path.name for path in (root / "figures").iterdir())
+    assert files == sorted(f"{name}.{suffix}" for name in names for suffix in ("png", "pdf"))
+    for name in names:
+        assert (root / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert (root / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+    labels = {
+        algo: plot._legend(algo, runs)
+        for condition, by_algo in plot.group_runs(results.read_results(root)[0]).items()
+        for algo, runs in by_algo.items()
+        if condition == ("R+L2", "")
+    }
+    assert labels["SRad"] == "SRad (3 of 5 seeds finished)"
+    assert (labels["DPro"], labels["NFW"]) == ("DPro", "NFW (n=3)")
+
+
+def test_different_configurations_are_never_averaged(tmp_path):
+    write_run(tmp_path, "R+N", "SRad", 0, result=10.0, threads=1)
+    write_run(tmp_path, "R+N", "SRad", 1, result=20.0, threads=2)  # does not change what is learned
+    write_run(tmp_path, "R+N", "SRad", 2, result=1000.0, gamma=0.5)
+    write_run(tmp_path, "R+N", "SRad", 0, result=50.0, overrides={"batch_size": 16})
+    write_run(tmp_path, "R+N", "DRad", 0, result=30.0)
+    assert plot.main([str(tmp_path)]) == 0
+    found = {(r["settings"], r["algo"], float(r["mean"]), r["n"]) for r in records(tmp_path, "rewards")}
+    assert found == {
+        ("", "DRad", 30.0, "1"),
+        ("batch_size=16", "SRad", 50.0, "1"),
+        ("gamma=0.5", "SRad", 1000.0, "1"),
+        ("gamma=0.99", "SRad", 15.0, "2"),
+    }
+    names = ["R+N", "R+N,batch_size=16", "R+N,gamma=0.5", "R+N,gamma=0.99"]
+    assert sorted(path.stem for path in (tmp_path / "figures").glob("*.png")) == names
+
+
+def test_one_run_in_progress_is_enough(tmp_path, capsys):
+    write_run(tmp_path, "R+N", "SRad", 0, evaluations=2)
+    assert plot.main([str(tmp_path)]) == 0
+    assert "R+N SRad: seed 0, evaluated to step 10,000" in capsys.readouterr().out
+    assert (tmp_path / "figures" / "R+N.png").exists()
+    assert list((tmp_path / "tables").iterdir()) == []
+
+
+def test_options(tmp_path):
+    root, out = tmp_path / "results", tmp_path / "out"
+    for task in ("R+N", "W+M"):
+        for algo in ("DPre+", "SRad", "NFW"):
+            write_run(root, task, algo, 0, result=1.0)
+    assert plot.main([str(root), "env=W+M", "algo=SRad,DPre+", f"out={out}", "format=csv,png"]) == 0
+    assert {(r["task"], r["algo"]) for r in records(out, "rewards")} == {("W+M", "DPre+"), ("W+M", "SRad")}
+    files = {str(path.relative_to(out)) for path in out.rglob("*.*")}
+    assert files == {"tables/rewards.csv", "tables/comparison.csv", "figures/W+M.png"}
+    assert not (root / "tables").exists()
+
+
+def test_usage(capsys):
+    for arguments in ([], ["--help"], ["results", "--help"]):
+        assert plot.main(arguments) == 0
+        printed = capsys.readouterr().out
+        assert "python plot.py results/" in printed and "env=" in printed
+
+
+def test_refusals(tmp_path, capsys):
+    assert "not a folder" in fails(capsys, tmp_path / "nowhere")
+    assert "no runs in" in fails(capsys, tmp_path)
+    write_run(tmp_path, "W+M", "SRad", 0, result=1.0)
+    write_run(tmp_path, "R+N", "DPre+", 0, result=1.0)
+    assert "'evn'" in (line := fails(capsys, tmp_path, "evn=W+M")) and "did you mean env?" in line
+    assert "did you mean SRad?" in (line := fails(capsys, tmp_path, "algo=srat")) and "DPre+" in line
+    assert "choices: R+N, W+M" in fails(capsys, tmp_path, "env=HC+O")
+    assert "choices: md, csv, tex, png, pdf" in fails(capsys, tmp_path, "format=jpg")
+    assert "given twice" in fails(capsys, tmp_path, "env=W+M", "env=R+N")
+    assert "expected env=value" in fails(capsys, tmp_path, "env=")
+    assert "expected one folder" in fails(capsys, tmp_path, "more")
+    assert "expected one folder" in fails(capsys, "env=W+M")
+    assert "no readable runs" in fails(capsys, tmp_path, "env=W+M", "algo=DPre+")
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    assert "file" in fails(capsys, tmp_path, f"out={blocked}")
+    assert not (tmp_path / "tables").exists()
+
+
+def test_command_line(tmp_path):
+    command = [sys.executable, str(ROOT / "plot.py")]
+    done = subprocess.run([*command, "nowhere"], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", "plot.py: nowhere is not a folder\n")
+    write_run(tmp_path / "results", "R+N", "SRad", 0, result=18.0)
+    done = subprocess.run([*command, "results/"], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "results" / "figures" / "R+N.pdf").exists()

@@ -52,9 +52,7 @@ class Constraint:
         """Closest feasible point (..., d) and the product with the projection's Jacobian there."""
         raise NotImplementedError
 
-    def _gauge_and_gradient(
-        self, obs: Tensor, direction: Tensor, center: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         """Gauge (...) of the whole set, box included, and its gradient (..., d) with respect to `direction`.
 
         Both are differentiable in `direction`, finite also at 0, where they are 0. `direction` has largest entry 1
@@ -129,9 +127,7 @@ class Constraint:
         mapped = factor.unsqueeze(-1) * offset
         return (mapped if center64 is None else center64 + mapped).to(action.dtype)
 
-    def radial_log_prob(
-        self, obs: Tensor, action: Tensor, log_prob: Tensor, center: Tensor | None = None
-    ) -> Tensor:
+    def radial_log_prob(self, obs: Tensor, action: Tensor, log_prob: Tensor, center: Tensor | None = None) -> Tensor:
         """Log-density (...) of `radial_map(obs, action)`, given the log-density `log_prob` (...) of `action`."""
         gauge = self._ray(obs, action, center)[2]
         return (log_prob.double() - radial_log_det(gauge, self.dim)).to(log_prob.dtype)

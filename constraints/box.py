@@ -19,9 +19,7 @@ class Box(Constraint):
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         return action.clamp(-1.0, 1.0), deflated_jacobian((action.abs() < 1.0).double())
 
-    def _gauge_and_gradient(
-        self, obs: Tensor, direction: Tensor, center: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         return largest_gauge(direction, box_gauge_gradient(direction, center))
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:

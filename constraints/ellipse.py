@@ -53,9 +53,7 @@ class DiagonalEllipse(Constraint):
         bent = None if center is None else scale * center
         return ellipse_gauge_gradient(direction, scale * direction, center, bent, self.bound)
 
-    def _gauge_and_gradient(
-        self, obs: Tensor, direction: Tensor, center: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         return largest_gauge(
             direction, box_gauge_gradient(direction, center), self.gauge_gradient(obs, direction, center)
         )
@@ -134,9 +132,7 @@ class PlanarEllipse(Constraint):
         (i, sign); empty (low > high) where the face is infeasible."""
         held = matrix.diagonal(dim1=-2, dim2=-1).unsqueeze(-1)
         moved = held.flip(-2)
-        cross = matrix[..., 0, 1, None, None] * torch.tensor(
-            [1.0, -1.0], dtype=matrix.dtype, device=matrix.device
-        )
+        cross = matrix[..., 0, 1, None, None] * torch.tensor([1.0, -1.0], dtype=matrix.dtype, device=matrix.device)
         discriminant = cross**2 - moved * (held - self.bound)
         root = discriminant.clamp(min=0.0).sqrt()
         curved = moved > 0.0
@@ -165,9 +161,7 @@ class PlanarEllipse(Constraint):
         best = value.argmax(-1, keepdim=True).unsqueeze(-1)
         return self._pull_in(obs, points.take_along_dim(best, -2).squeeze(-2))
 
-    def _gauge_and_gradient(
-        self, obs: Tensor, direction: Tensor, center: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         matrix = self.matrix(obs)
         bent = None if center is None else _times(matrix, center)
         return largest_gauge(
@@ -204,9 +198,7 @@ def ellipse_gauge_gradient(
     square = slope**2 + curvature * slack
     met = square > 0.0
     root = torch.where(met, square, 1.0).sqrt()
-    return torch.where(
-        met, (bent_center + (slope * bent_center + slack * bent_direction) / root) / slack, 0.0
-    )
+    return torch.where(met, (bent_center + (slope * bent_center + slack * bent_direction) / root) / slack, 0.0)
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:

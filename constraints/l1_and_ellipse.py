@@ -24,9 +24,7 @@ class WeightedL1AndEllipse(Constraint):
     Projection and oracle have two multipliers: the row's is exact for each value of the ellipse's.
     """
 
-    def __init__(
-        self, weight: Coefficients, weight_bound: float, scale: Coefficients, scale_bound: float, dim: int
-    ):
+    def __init__(self, weight: Coefficients, weight_bound: float, scale: Coefficients, scale_bound: float, dim: int):
         super().__init__(dim)
         self.l1 = WeightedL1(weight, weight_bound, dim)
         self.ellipse = DiagonalEllipse(scale, scale_bound, dim)
@@ -54,9 +52,7 @@ class WeightedL1AndEllipse(Constraint):
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         return self._pull_in(obs, self._solve(obs, gradient, 0.0)[0])
 
-    def _gauge_and_gradient(
-        self, obs: Tensor, direction: Tensor, center: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         return largest_gauge(
             direction,
             box_gauge_gradient(direction, center),

@@ -101,9 +101,7 @@ class _WeightPatterns(Constraint):
         row = self._row(weight, side)
         return row / (bound - (row * center).sum(-1, keepdim=True))
 
-    def _gauge_and_gradient(
-        self, obs: Tensor, direction: Tensor, center: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         return largest_gauge(
             direction, box_gauge_gradient(direction, center), self.gauge_gradient(obs, direction, center)
         )
@@ -142,9 +140,12 @@ class WeightedPositivePart(_WeightPatterns):
 
 
 class HalfSpace(_WeightPatterns):
-    """weight.a <= bound in the box: one row (HC+MA)."""
+    """normal.a <= bound in the box: one row (HC+MA)."""
 
     origin_centered = False
+
+    def __init__(self, normal: Coefficients, bound: float, dim: int):
+        super().__init__(normal, bound, dim)
 
     def _patterns(self, device: torch.device) -> Tensor:
         return torch.ones(1, self.dim, dtype=torch.float64, device=device)

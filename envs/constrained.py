@@ -59,7 +59,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         """Start an episode; return observation (n,) and info. `seed` as Gymnasium defines it."""
         super().reset(seed=seed)
         obs = self.robot.reset(self.np_random)
-        self._obs, self.elapsed_steps = torch.tensor(obs), 0
+        self._obs, self.elapsed_steps = torch.from_numpy(obs.copy()), 0
         return obs, {}
 
     def step(self, action):
@@ -72,7 +72,7 @@ class ActionConstrainedEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded(f"{self.task}: call reset() before step()")
         action = self._feasible(action)
         obs, reward, terminated, info = self.robot.step(action)
-        self._obs = torch.tensor(obs)
+        self._obs = torch.from_numpy(obs.copy())
         self.executed_actions += 1
         self.elapsed_steps += 1
         if self.project:
@@ -93,12 +93,10 @@ class ActionConstrainedEnv(gymnasium.Env):
         action = np.asarray(action)
         if action.shape != self.action_space.shape:
             expected = self.action_space.shape
-            raise InfeasibleActionError(
-                f"{self._where()}: action has shape {action.shape}, expected {expected}"
-            )
+            raise InfeasibleActionError(f"{self._where()}: action has shape {action.shape}, expected {expected}")
         if not np.isfinite(action).all():
             raise InfeasibleActionError(f"{self._where()}: action {action} is not finite")
-        exact = torch.tensor(action, dtype=torch.float64)
+        exact = torch.from_numpy(action.astype(np.float64))
         violation = self.constraint.violation(self._obs, exact).item()
         if self.project and violation > 0:
             exact = self.constraint.project(self._obs, exact)

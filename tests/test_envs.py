@@ -1,0 +1,456 @@
+"""Environments: equality with the originals, the feasibility check, Gymnasium's interface, pictures."""
+
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+import envs
+from envs.locomotion import HalfCheetah, Hopper, Walker2d
+from envs.reacher import Reacher
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT / "tests" / "data"
+NAMES = ["R+N", "R+L2", "R+O03", "R+O10", "R+O30", "R+M", "R+T", "HC+O", "HC+MA", "H+M", "H+O+S", "W+M", "W+O+S"]
+LOCOMOTION = [("HalfCheetah", HalfCheetah, "HC+O"), ("Hopper", Hopper, "H+M"), ("Walker2d", Walker2d, "W+M")]
+SMALL = 0.05  # actions up to this size are feasible in every task at any state the tests reach
+
+
+def gymnasium_v4(name, **kwargs):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # "v4 is out of date": it is the one meant
+        return gymnasium.make(f"{name}-v4", **kwargs)
+
+
+def draw(rng, env):
+    return rng.uniform(-1, 1, env.action_space.shape)
+
+
+# ---------------------------------------------------------------- the originals
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_reacher_matches_the_original(seed):
+    golden = np.load(DATA / f"golden_seed{seed}.npz")
+    robot, other = Reacher(), Reacher()
+    rng, noise = np.random.default_rng(seed), np.random.default_rng(5)
+    for obs, actions, rewards in zip(golden["obs"], golden["actions"], golden["rewards"], strict=True):
+        other.reset(noise)  # a neighbour in the same process must not disturb it
+        np.testing.assert_allclose(robot.reset(rng), obs[0], rtol=0, atol=1e-6)
+        for action, expected_obs, expected_reward in zip(actions, obs[1:], rewards, strict=True):
+            other.step(noise.uniform(-1, 1, 2))
+            got_obs, reward, terminated, _ = robot.step(action)
+            np.testing.assert_allclose(got_obs, expected_obs, rtol=0, atol=1e-6)
+            assert abs(reward - expected_reward) < 1e-6
+            assert not terminated
+    robot.close()
+    other.close()
+
+
+def test_reacher_env_seeds_as_the_original():
+    env = envs.make("R+N")
+    for seed in (0, 1):
+        first, second = np.load(DATA / f"golden_seed{seed}.npz")["obs"][:, 0]
+        np.testing.assert_allclose(env.reset(seed=seed)[0], first, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(env.reset()[0], second, rtol=0, atol=1e-6)
+    env.close()
+
+
+def test_reacher_penalises_a_stuck_joint():
+    robot = Reacher()
+    robot.reset(np.random.default_rng(0))
+    for gamma, penalty in ((2.985, -0.1), (-2.985, -0.1), (2.9, 0.0)):
+        for name, position in (("joint0", 0.0), ("joint1", gamma)):
+            robot._bullet.resetJointState(*robot._joints[name], position, 0.0, physicsClientId=robot._client)
+        robot._potential = robot._observe()[1]
+        obs, reward, _, _ = robot.step(np.zeros(2))  # nothing moves: no progress, no cost of torques
+        assert obs[7] == pytest.approx(gamma / 3)
+        assert reward == pytest.approx(penalty, abs=1e-9)
+    robot.close()
+
+
+@pytest.mark.parametrize("name, robot_class, task", LOCOMOTION)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_locomotion_equals_gymnasium_v4(name, robot_class, task, seed):
+    """Whole training-like stretches, falls and resets included, in both precisions, to the last bit."""
+    reference, robot = gymnasium_v4(name).unwrapped, robot_class()
+    rng, noise = np.random.default_rng(seed), np.random.default_rng(seed + 10)
+    np.testing.assert_array_equal(robot.reset(rng), reference.reset(seed=seed)[0])
+    falls = 0
+    for t in range(1200):
+        action = noise.uniform(-1, 1, robot.action_dim).astype(np.float32 if t % 2 else np.float64)
+        expected_obs, expected_reward, expected_terminated, _, expected_info = reference.step(action)
+        obs, reward, terminated, info = robot.step(action)
+        np.testing.assert_array_equal(obs, expected_obs)
+        assert obs.dtype == expected_obs.dtype == np.float64
+        assert reward == expected_reward
+        assert terminated == expected_terminated
+        assert info == {key: expected_info[key] for key in ("x_position", "x_velocity")}
+        if terminated:
+            falls += 1
+            np.testing.assert_array_equal(robot.reset(rng), reference.reset()[0])
+    assert falls == 0 if name == "HalfCheetah" else falls > 10
+
+
+@pytest.mark.parametrize("name, robot_class, task", LOCOMOTION)
+def test_locomotion_env_equals_gymnasium_v4_through_the_time_limit(name, robot_class, task):
+    reference, env = gymnasium_v4(name, disable_env_checker=True), envs.make(task, project=True)
+    noise = np.random.default_rng(3)
+    for seed in (7, None):  # the second reset continues the first one's random stream
+        np.testing.assert_array_equal(env.reset(seed=seed)[0], reference.reset(seed=seed)[0])
+        for t in range(1000):  # past any fall, as both environments allow
+            obs, reward, terminated, truncated, info = env.step(draw(noise, env))
+            expected = reference.step(info["executed_action"])
+            np.testing.assert_array_equal(obs, expected[0])
+            assert (reward, terminated, truncated) == expected[1:4]
+            assert truncated == (t == 999)
+
+
+def test_reacher_env_truncates_after_150_steps():
+    env = envs.make("R+N")
+    for _ in range(2):
+        env.reset(seed=0)
+        ends = [env.step(np.zeros(2))[2:4] for _ in range(150)]
+        assert ends == [(False, False)] * 149 + [(False, True)]
+
+
+@pytest.mark.parametrize("robot_class", [HalfCheetah, Hopper, Walker2d])
+def test_frame_rate_is_real_time(robot_class):
+    robot = robot_class()
+    assert robot.model.opt.timestep * robot.frame_skip * robot.fps == pytest.approx(1)
+
+
+# ---------------------------------------------------------------- the table of tasks
+
+
+def joint_angles_and_velocities(env):
+    """theta and w (d,) of the driven joints, looked up by joint in the simulator rather than by index in obs."""
+    robot = env.robot
+    if isinstance(robot, Reacher):
+        (theta1, w1), (theta2, w2) = robot._joint_state("joint0"), robot._joint_state("joint1")
+        return np.array([theta1, theta2 / 3]), 0.1 * np.array([w1, w2])
+    joints = robot.model.actuator_trnid[:, 0]
+    angles = robot.data.qpos[robot.model.jnt_qposadr[joints]]
+    velocities = robot.data.qvel[robot.model.jnt_dofadr[joints]]
+    return angles, velocities if isinstance(robot, HalfCheetah) else velocities.clip(-10, 10)
+
+
+def excess(task, a, theta, w):
+    """The constraints of the paper's table at actions (n, d), each as left side over bound minus 1, (n, k)."""
+    l1, positive = np.abs(w * a).sum(-1), np.maximum(w * a, 0).sum(-1)
+    ellipse = (a**2 * np.sin(theta) ** 2).sum(-1)
+    a1, a2 = a[:, 0], a[:, 1]
+    sides = {
+        "R+N": [],
+        "R+L2": [(a1**2 + a2**2) / 0.05],
+        "R+O03": [l1 / 0.3],
+        "R+O10": [l1 / 1],
+        "R+O30": [l1 / 3],
+        "R+M": [positive / 1],
+        "R+T": [(a1**2 + 2 * a1 * (a1 + a2) * np.cos(theta[1]) + (a1 + a2) ** 2) / 0.05],
+        "HC+O": [l1 / 20],
+        "H+M": [positive / 10],
+        "H+O+S": [l1 / 10, ellipse / 0.1],
+        "W+M": [positive / 10],
+        "W+O+S": [l1 / 10, ellipse / 0.1],
+    }
+    if task == "HC+MA":
+        back, front = np.sin(theta[:3].sum()), np.sin(theta[3:].sum())
+        sides["HC+MA"] = [(w[0] * a[:, 0] * back + w[3] * a[:, 3] * front) / 5]
+    return np.stack([np.abs(a).max(-1), *sides[task]], -1) - 1
+
+
+def test_table_of_tasks():
+    assert list(envs.TASKS) == NAMES
+    for name, task in envs.TASKS.items():
+        assert task.steps == (300_000 if name.startswith("R+") else 1_000_000)
+        assert task.constraint.dim == task.robot.action_dim
+        assert envs.constraint(name) is task.constraint
+        assert task.description
+
+
+@pytest.mark.parametrize("task", NAMES)
+def test_feasible_set_is_the_papers(task):
+    """Feasibility of random actions along a rollout, against the paper's formulas on the simulator's joints."""
+    env, rng = envs.make(task, project=True), np.random.default_rng(0)
+    infeasible = set()
+    for t in range(600):
+        if t % 100 == 0:  # past any fall: that is where the velocities are
+            obs, _ = env.reset(seed=t)
+        if t % 20 == 0:  # one push for a while, the longer for the constraint to matter
+            push = rng.choice([-1.0, 1.0], env.action_space.shape)
+        # actions of every length, many at corners of the box, some beyond it
+        actions = rng.normal(0, 1.5, (64, *env.action_space.shape)).clip(-1, 1) * rng.uniform(0, 1.1, (64, 1))
+        sides = excess(task, actions, *joint_angles_and_velocities(env))
+        violation = env.constraint.violation(torch.from_numpy(obs), torch.from_numpy(actions)).numpy()
+        clear = np.abs(sides).min(-1) > 1e-9  # rounding decides on the boundary itself
+        np.testing.assert_array_equal((violation <= 0)[clear], (sides <= 0).all(-1)[clear])
+        infeasible.update(np.flatnonzero((sides > 0).any(0)))
+        obs = env.step(push)[0]
+    assert infeasible == set(range(sides.shape[1]))  # the box and every constraint were exceeded somewhere
+    env.close()
+
+
+# ---------------------------------------------------------------- the feasibility check
+
+
+def reach_an_infeasible_action(env, rng):
+    """Drive `env` by feasible actions to a state with a clearly infeasible one inside the box; return that."""
+    obs, _ = env.reset(seed=1)
+    for _ in range(1000):
+        corners = torch.from_numpy(rng.choice([-1.0, 1.0], (64, env.action_space.shape[0])))
+        violation = env.constraint.violation(torch.from_numpy(obs), corners)
+        if violation.max() > 0.01:
+            return corners[violation.argmax()].numpy()
+        action = env.constraint.project(torch.from_numpy(obs), torch.from_numpy(draw(rng, env)))
+        obs, _, terminated, truncated, _ = env.step(action.numpy())
+        if terminated or truncated:
+            obs, _ = env.reset()
+    raise AssertionError("every corner of the box stayed feasible")
+
+
+@pytest.mark.parametrize("task", NAMES)
+def test_infeasible_action_is_refused_and_projected_on_request(task):
+    env = envs.make(task)
+    if task == "R+N":
+        env.reset(seed=1)
+        action = np.array([1.5, 0.0])
+    else:
+        action = reach_an_infeasible_action(env, np.random.default_rng(0))
+    before, count, step = env._obs.clone(), env.executed_actions, env.elapsed_steps
+    violation = env.constraint.violation(before, torch.from_numpy(action)).item()
+    with pytest.raises(envs.InfeasibleActionError) as refusal:
+        env.step(action)
+    for part in (f"{task}, step {step + 1} ", f"{violation:.3g}"):
+        assert part in str(refusal.value)
+    assert isinstance(refusal.value, ValueError)
+    assert (env.executed_actions, env.elapsed_steps) == (count, step)
+    assert env.largest_violation <= envs.TOLERANCE
+
+    expected = env.constraint.project(before, torch.from_numpy(action)).numpy()
+    env.project = True
+    obs, _, _, _, info = env.step(action)
+    np.testing.assert_array_equal(info["executed_action"], expected)
+    assert np.abs(expected - action).max() > 1e-3
+    assert env.executed_actions == count + 1
+    assert env.largest_violation <= envs.TOLERANCE
+    assert not np.array_equal(obs, before.numpy())  # it was executed after all
+    env.close()
+
+
+def test_tolerance_and_bookkeeping():
+    env = envs.make("R+N")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(2))
+    env.reset(seed=0)
+    assert (env.largest_violation, env.executed_actions) == (-np.inf, 0)
+    env.step(np.array([0.25, 0.5]))
+    assert (env.largest_violation, env.executed_actions) == (-0.5, 1)
+    env.step(np.array([1 + 9e-7, 0.0]))
+    assert env.largest_violation == pytest.approx(9e-7, rel=1e-6)
+    with pytest.raises(envs.InfeasibleActionError):
+        env.step(np.array([1 + 1.1e-6, 0.0]))
+    env.reset()
+    assert (env.executed_actions, env.elapsed_steps) == (2, 0)  # the check's record outlives the episode
+    env.close()
+
+
+def test_feasible_action_is_executed_as_it_is_when_projecting():
+    env = envs.make("R+L2", project=True)
+    env.reset(seed=0)
+    action = np.array([0.1, -0.1], np.float32)
+    executed = env.step(action)[4]["executed_action"]
+    np.testing.assert_array_equal(executed, action)
+    assert not np.shares_memory(executed, action)
+    env.close()
+
+
+def test_check_uses_its_own_copy_of_the_observation():
+    env = envs.make("R+O03")
+    obs, _ = env.reset(seed=0)
+    obs[:] = 1e6  # the velocities would make the action infeasible
+    obs, *_ = env.step(np.array([0.5, 0.5]))
+    obs[:] = 1e6
+    env.step(np.array([0.01, 0.01]))
+    env.close()
+
+
+@pytest.mark.parametrize("project", [False, True])
+def test_what_is_no_action_is_refused(project):
+    env = envs.make("H+M", project=project)
+    env.reset(seed=0)
+    for bad in (np.nan, np.inf, -np.inf):
+        with pytest.raises(envs.InfeasibleActionError, match="H.M, step 1 .* not finite"):
+            env.step(np.array([0.0, bad, 0.0]))
+    for bad in (np.zeros(2), np.zeros((1, 3)), 0.0):
+        with pytest.raises(envs.InfeasibleActionError, match=r"H.M, step 1 .* expected \(3,\)"):
+            env.step(bad)
+    assert env.executed_actions == 0
+
+
+# ---------------------------------------------------------------- Gymnasium's interface
+
+
+@pytest.mark.filterwarnings("ignore:.*observation space m(in|ax)imum value is -?infinity")
+@pytest.mark.parametrize("project", [False, True])
+@pytest.mark.parametrize("task", NAMES)
+def test_gymnasium_checker(task, project):
+    env = gymnasium.make(f"acrl/{task.replace('+', '-')}-v0", project=project).unwrapped
+    assert type(env) is type(envs.make(task))
+    assert env.observation_space.dtype == np.float64
+    assert env.action_space == gymnasium.spaces.Box(-1, 1, (env.constraint.dim,), np.float32)
+    if not project:  # the checker executes what it samples, which has to be feasible then
+        env.action_space = gymnasium.spaces.Box(-SMALL, SMALL, env.action_space.shape, np.float32)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="(?!.*(infinity|recommend|render))")
+        check_env(env, skip_render_check=True)
+    assert env.executed_actions > 0
+    env.close()
+
+
+def test_same_seed_same_rollout():
+    rollouts = []
+    for _ in range(2):
+        env, rng = envs.make("W+O+S", project=True), np.random.default_rng(0)
+        rollouts.append([env.reset(seed=3)[0]] + [env.step(draw(rng, env))[0] for _ in range(50)])
+        env.close()
+    np.testing.assert_array_equal(*rollouts)
+
+
+@pytest.mark.parametrize("task", NAMES)
+def test_gymnasium_make_wrappers_keep_the_environment(task):
+    env = gymnasium.make(f"acrl/{task.replace('+', '-')}-v0", project=True)
+    assert env.unwrapped.task == task
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    rewards, done = 0.0, False
+    while not done:
+        _, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        assert "executed_action" in info
+        rewards, done = rewards + reward, terminated or truncated
+    assert np.isfinite(rewards)
+    assert env.unwrapped.largest_violation <= envs.TOLERANCE
+    env.close()
+
+
+def test_unknown_task():
+    for call in (envs.make, envs.constraint):
+        with pytest.raises(ValueError, match="unknown task 'w.m'; did you mean 'W.M'") as error:
+            call("w+m")
+        assert " ".join(NAMES) in str(error.value)
+        with pytest.raises(ValueError, match=r"unknown task 'Ant' \(choices"):
+            call("Ant")
+    with pytest.raises(ValueError, match="render_mode 'human'"):
+        envs.make("R+N", render_mode="human")
+
+
+@pytest.mark.parametrize("absent, task", [("pybullet", "HC+O"), ("mujoco", "R+T")])
+def test_needs_only_its_own_simulator_and_is_silent(absent, task, tmp_path):
+    code = f"""
+import sys
+sys.modules[{absent!r}] = None  # importing it fails
+import envs
+env = envs.make({task!r})
+env.reset(seed=0)
+env.step([0.0] * env.action_space.shape[0])
+env.close()
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+    assert list(tmp_path.iterdir()) == []  # no MUJOCO_LOG.TXT
+
+
+def test_close_frees_the_physics_client():
+    env, neighbour = envs.make("R+N"), envs.make("R+N")
+    bullet, client = env.robot._bullet, env.robot._client
+    assert bullet.getConnectionInfo(client)["isConnected"]
+    env.close()
+    assert not bullet.getConnectionInfo(client)["isConnected"]
+    env.close()
+    neighbour.reset(seed=0)  # has a client of its own
+    neighbour.step(np.zeros(2))
+    neighbour.close()
+
+
+# ---------------------------------------------------------------- pictures
+
+
+def picture(env):
+    """A picture, or None where this machine has no OpenGL backend, which the error then has to say."""
+    try:
+        frame = env.render()
+    except RuntimeError as error:
+        assert "libegl1 or libosmesa6" in str(error)
+        return None
+    assert (frame.shape, frame.dtype) == ((480, 480, 3), np.uint8)
+    return frame.astype(int)
+
+
+def test_no_picture_without_render_mode():
+    env = envs.make("R+N")
+    env.reset(seed=0)
+    assert env.render() is None
+    env.close()
+
+
+def test_reacher_picture_shows_arm_and_target():
+    env = envs.make("R+N", render_mode="rgb_array")
+    assert env.metadata == {"render_modes": ["rgb_array"], "render_fps": 61}
+    env.reset(seed=0)
+    first = picture(env)
+    red = (first[..., 0] > first[..., 1] + 60) & (first[..., 0] > first[..., 2] + 60)
+    blue = (first[..., 2] > first[..., 0] + 60) & (first[..., 0] < 60)
+    assert red.sum() > 20
+    assert blue.sum() > 300
+    for _ in range(20):
+        env.step(np.ones(2))
+    assert (picture(env) != first).any()
+    env.close()
+
+
+@pytest.mark.parametrize("name, robot_class, task", LOCOMOTION)
+def test_camera_follows_the_robot(name, robot_class, task):
+    env = envs.make(task, render_mode="rgb_array")
+    env.reset(seed=0)
+    for x in (0.0, 30.3):
+        env.robot.data.qpos[0] = x
+        env.step(np.zeros(env.action_space.shape))
+        frame = picture(env)
+        if frame is None:
+            break
+        skin = frame[..., 0] > frame[..., 2] + 30  # the floor and the sky are grey, green or blue
+        rows, columns = np.nonzero(skin)
+        assert skin.sum() > 1000
+        assert abs(columns.mean() - 240) < 60
+        assert np.percentile(rows, 1) > 0 and np.percentile(rows, 99) < 479
+    env.close()
+
+
+def test_no_opengl_backend_is_a_clear_error(monkeypatch):
+    env = envs.make("H+M", render_mode="rgb_array")
+    env.reset(seed=0)
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    with pytest.raises(RuntimeError, match="backend 'nonsense' does not work on this machine"):
+        env.render()
+    for variable in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("ctypes.util.find_library", lambda library: None)
+    with pytest.raises(RuntimeError, match="libegl1 or libosmesa6"):
+        env.render()
+    env.step(np.zeros(3))  # training goes on
+    env.close()

@@ -1,7 +1,7 @@
 """Log-densities of a policy after the radial and alpha maps (paper, "Action Constraints to SAC").
 
 Both carry their gradients in closed form: autograd through the formulas would meet 0/0 or cancel, and cost more.
-A second derivative is refused by PyTorch, not silently wrong.
+First derivatives only: `create_graph=True` is refused with a RuntimeError.
 """
 
 from __future__ import annotations
@@ -12,10 +12,15 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 _NODES = 28  # Gauss-Legendre nodes on the window of the ray integral
 _DROP = 25.0  # the window ends where the log of the integrand has fallen by at least this much
+
+
+def _refuse_second_derivatives() -> None:
+    # PyTorch's once_differentiable would let them pass as zeros: the saved tensors carry no graph.
+    if torch.is_grad_enabled():
+        raise RuntimeError("the log-densities of the radial and alpha maps have first derivatives only")
 
 
 class _RadialLogDet(torch.autograd.Function):
@@ -29,14 +34,15 @@ class _RadialLogDet(torch.autograd.Function):
             fraction = square / fraction + odd
         small = gauge < 1
         excess = torch.where(small, square / fraction, gauge / tanh - 1)
-        excess_over_gauge = torch.where(small, gauge / fraction, 1 / tanh - 1 / gauge)
-        ctx.save_for_backward((dim - 1) * excess_over_gauge - (dim + 1) * tanh)
+        ctx.save_for_backward(
+            (dim - 1) * torch.where(small, gauge / fraction - tanh, 1 / tanh - tanh - 1 / gauge) - 2 * tanh
+        )
         log_cosh = gauge + torch.log1p(torch.expm1(-2 * gauge) / 2)
         return (1 - dim) * torch.log1p(excess) - 2 * log_cosh
 
     @staticmethod
-    @once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
+        _refuse_second_derivatives()
         (slope,) = ctx.saved_tensors
         return grad * slope, None
 
@@ -128,8 +134,8 @@ class _AlphaBoundaryLogDensity(torch.autograd.Function):
         return (log_integral - per_axis.sum(-1) - normal_square.log() / 2).to(boundary_offset.dtype)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx, grad):
+        _refuse_second_derivatives()
         normal, normal_square, std, ray, foot, residual, slope, by_slope, by_intercept = ctx.saved_tensors
         grad = grad.double()
         # Derivatives by start and ray are -E[start + t ray] and -E[t (start + t ray)] under the integrand.

@@ -169,6 +169,9 @@ def test_a_death_while_writing_leaves_the_old_file_or_none(tmp_path, monkeypatch
             writer.finish({"return_mean": 1.0})
     assert torch.load(writer.folder / "best.pt")["weight"].tolist() == [1.0, 1.0]
     assert not results.is_finished(writer.folder)
+    with open(writer.folder / "best.pt", "rb") as opened_before:
+        writer.save_parameters("best", {"weight": torch.zeros(2)})
+        assert torch.load(opened_before)["weight"].tolist() == [1.0, 1.0]  # replaced, not written over
     writer.finish({"return_mean": 1.0})
     assert results.read_run(writer.folder).result == {"return_mean": 1.0}
 
@@ -241,7 +244,10 @@ def test_description_names_the_commit(tmp_path, monkeypatch):
     code = tmp_path / "results.py"
     code.write_text("first\n")
     monkeypatch.setattr(results, "__file__", str(code))
+    (tmp_path / "other.py").write_text("")
     git("init")
+    git("add", "other.py")
+    git("commit", "-m", "without it", "--no-verify")
     assert results.describe_environment([])["commit"] is None  # not a file of that repository
     git("add", ".")
     git("commit", "-m", "first", "--no-verify")

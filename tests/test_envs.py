@@ -113,6 +113,25 @@ def test_locomotion_env_equals_gymnasium_v4_through_the_time_limit(name, robot_c
             assert truncated == (t == 999)
 
 
+@pytest.mark.parametrize("name, robot_class", [("Hopper", Hopper), ("Walker2d", Walker2d)])
+def test_falls_are_gymnasiums_on_both_sides_of_every_limit(name, robot_class):
+    reference, robot = gymnasium_v4(name).unwrapped, robot_class()
+    robot.reset(np.random.default_rng(0))
+    limits = [("qpos", 1, z) for z in (0.7, 0.8, 2.0)]
+    limits += [("qpos", 2, angle) for angle in (-1.0, -0.2, 0.2, 1.0)]
+    limits += [(part, i, value) for part in ("qpos", "qvel") for i in (-1, -2, -3) for value in (-100, 100)]
+    limits += [("qvel", 0, -100.0), ("qvel", 0, 100.0)]
+    seen = set()
+    for part, index, limit in limits:
+        for value in (limit - 1e-6, limit, limit + 1e-6):
+            for data in (reference.data, robot.data):
+                data.qpos[:], data.qvel[:] = robot.model.qpos0, 0.0
+                getattr(data, part)[index] = value
+            assert robot._healthy() == reference.is_healthy
+            seen.add(robot._healthy())
+    assert seen == {True, False}
+
+
 def test_reacher_env_truncates_after_150_steps():
     env = envs.make("R+N")
     for _ in range(2):
@@ -312,6 +331,14 @@ def test_gymnasium_checker(task, project):
         warnings.filterwarnings("error", message="(?!.*(infinity|recommend|render))")
         check_env(env, skip_render_check=True)
     assert env.executed_actions > 0
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*observation space m(in|ax)imum value is -?infinity")
+def test_gymnasium_checker_with_pictures():
+    env = gymnasium.make("acrl/R-N-v0", project=True, render_mode="rgb_array")
+    assert env.render_mode == "rgb_array"
+    check_env(env.unwrapped)
     env.close()
 
 

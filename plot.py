@@ -134,7 +134,7 @@ def group_runs(runs: Iterable[Run]) -> Groups:
 
 
 def _text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
 
 
 def reward_statistics(groups: Groups) -> dict[Condition, dict[str, Statistic]]:
@@ -218,7 +218,7 @@ def reward_table(statistics: dict[Condition, dict[str, Statistic]]) -> Table:
             row = statistics[condition]
             digits = decimals(stat.mean for stat in row.values())
             best = best_three({algo: stat.mean for algo, stat in row.items()})
-            cells = [Cell(tuple(filter(None, condition)))]
+            cells = [Cell(tuple(condition.label.split(", ")))]
             for algo in algos:
                 same = SAME_WITHOUT_CONSTRAINT.get(algo) if condition.task == "R+N" else None
                 if algo in row:

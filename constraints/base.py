@@ -90,7 +90,8 @@ class Constraint:
         """Closest feasible point (..., d) in the Euclidean norm, with its exact Jacobian in `action`."""
         obs64, action64 = self._broadcast(obs, action.detach())
         with torch.no_grad():
-            solution = self._project(obs64, action64)
+            projected, jacobian_product = self._project(obs64, action64)
+            solution = _keep_nan(projected, action64), jacobian_product
         if torch.is_grad_enabled() and action.requires_grad:
             return _Projection.apply(action.expand(action64.shape), solution)
         return solution[0].to(action.dtype)
@@ -161,7 +162,7 @@ class Constraint:
         """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction)."""
         obs64, gradient64 = self._broadcast(obs, gradient.detach())
         with torch.no_grad():
-            return self._linear_oracle(obs64, gradient64).to(gradient.dtype)
+            return _keep_nan(self._linear_oracle(obs64, gradient64), gradient64).to(gradient.dtype)
 
     # ---------------------------------------------------------------- shared pieces
 
@@ -256,6 +257,11 @@ class _Projection(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor):
         return ctx.jacobian_product(grad.double()).to(grad.dtype), None
+
+
+def _keep_nan(solution: Tensor, source: Tensor) -> Tensor:
+    """NaN wherever the source has one: a broken policy must not turn into a feasible action unnoticed."""
+    return torch.where(source.isnan().any(-1, keepdim=True), torch.nan, solution)
 
 
 def safe_sqrt(square: Tensor) -> Tensor:

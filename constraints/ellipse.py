@@ -80,7 +80,7 @@ class PlanarEllipse(Constraint):
         return self._violation(obs, action).clamp(min=0.0)
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        matrix = self.matrix(obs)
+        matrix = self.matrix(obs).expand(*action.shape[:-1], 2, 2)
         boxed = action.clamp(-1.0, 1.0)
         on_ellipse, tangent_jacobian = self._project_on_ellipse(matrix, action)
         low, high = self._face_intervals(matrix)
@@ -143,16 +143,15 @@ class PlanarEllipse(Constraint):
         return torch.where(met, low, 2.0), torch.where(met, high, -2.0)
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        matrix = self.matrix(obs)
+        matrix = self.matrix(obs).expand(*gradient.shape[:-1], 2, 2)
         # The maximiser over the ellipse alone, along inv(Q) gradient = adj(Q) gradient / det Q.
         diagonal = matrix.diagonal(dim1=-2, dim2=-1)
         ascent = diagonal.flip(-1) * gradient - matrix[..., 0, 1, None] * gradient.flip(-1)
         size = (ascent * _times(matrix, ascent)).sum(-1, keepdim=True)
         on_ellipse = ascent * (self.bound / size).sqrt()
         low, high = self._face_intervals(matrix)
-        lead = gradient.shape[:-1]
-        ends = torch.cat((_face_points(low), _face_points(high)), -2).expand(*lead, 8, 2)
-        met = (low <= high).flatten(-2).expand(*lead, 4)
+        ends = torch.cat((_face_points(low), _face_points(high)), -2)
+        met = (low <= high).flatten(-2)
         origin = torch.zeros_like(gradient)
         points = torch.cat((torch.stack((origin, on_ellipse), -2), ends), -2)
         inside = on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + 1e-12

@@ -1,0 +1,518 @@
+"""Closed forms of the paper's 13 feasible sets against independent solvers and their own definitions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from references import ReferenceSet, sign_rows, subset_rows
+from torch import Tensor
+
+from constraints import (
+    Box,
+    Constraint,
+    DiagonalEllipse,
+    HalfSpace,
+    PlanarEllipse,
+    WeightedL1,
+    WeightedL1AndEllipse,
+    WeightedPositivePart,
+)
+
+# Observations here are (velocities, angles), d of each.
+
+
+def velocities(obs: Tensor) -> Tensor:
+    return obs[..., : obs.shape[-1] // 2]
+
+
+def angles(obs: Tensor) -> Tensor:
+    return obs[..., obs.shape[-1] // 2 :]
+
+
+def squared_sines(obs: Tensor) -> Tensor:
+    return angles(obs).sin() ** 2
+
+
+def ones(obs: Tensor) -> Tensor:
+    return torch.ones_like(velocities(obs))
+
+
+def tip_matrix(obs: Tensor) -> Tensor:
+    cos = angles(obs)[..., 1].cos()
+    rows = torch.stack((2.0 + 2.0 * cos, 1.0 + cos), -1), torch.stack((1.0 + cos, torch.ones_like(cos)), -1)
+    return torch.stack(rows, -2)
+
+
+def leg_normal(obs: Tensor) -> Tensor:
+    w, theta = velocities(obs), angles(obs)
+    zero = torch.zeros_like(w[..., 0])
+    first = w[..., 0] * theta[..., :3].sum(-1).sin()
+    second = w[..., 3] * theta[..., 3:].sum(-1).sin()
+    return torch.stack((first, zero, zero, second, zero, zero), -1)
+
+
+def no_rows(dim: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros((0, dim)), np.zeros(0)
+
+
+def reference_l1(bound: float) -> Callable[[np.ndarray, np.ndarray], ReferenceSet]:
+    def build(w: np.ndarray, theta: np.ndarray) -> ReferenceSet:
+        rows = sign_rows(w)
+        return ReferenceSet(rows, np.full(len(rows), bound))
+
+    return build
+
+
+def reference_positive(bound: float) -> Callable[[np.ndarray, np.ndarray], ReferenceSet]:
+    def build(w: np.ndarray, theta: np.ndarray) -> ReferenceSet:
+        rows = subset_rows(w)
+        return ReferenceSet(rows, np.full(len(rows), bound))
+
+    return build
+
+
+def reference_half_space(w: np.ndarray, theta: np.ndarray) -> ReferenceSet:
+    row = np.zeros((1, 6))
+    row[0, 0] = w[0] * math.sin(theta[:3].sum())
+    row[0, 3] = w[3] * math.sin(theta[3:].sum())
+    return ReferenceSet(row, np.array([5.0]))
+
+
+def reference_tip(w: np.ndarray, theta: np.ndarray) -> ReferenceSet:
+    # a1^2 + 2 a1 (a1 + a2) cos + (a1 + a2)^2 = |a1 (1, 0) + (a1 + a2) (cos, sin)|^2
+    frame = np.array([[1.0, math.cos(theta[1])], [0.0, math.sin(theta[1])]]) @ np.array([[1.0, 0.0], [1.0, 1.0]])
+    return ReferenceSet(*no_rows(2), frame.T @ frame, 0.05)
+
+
+def reference_both(w: np.ndarray, theta: np.ndarray) -> ReferenceSet:
+    rows = sign_rows(w)
+    return ReferenceSet(rows, np.full(len(rows), 10.0), np.diag(np.sin(theta) ** 2), 0.1)
+
+
+@dataclass(frozen=True)
+class Task:
+    constraint: Constraint
+    reference: Callable[[np.ndarray, np.ndarray], ReferenceSet]
+    linear: bool = False
+
+    def reference_at(self, obs: Tensor) -> ReferenceSet:
+        return self.reference(velocities(obs).numpy(), angles(obs).numpy())
+
+
+TASKS = {
+    "R+N": Task(Box(2), lambda w, theta: ReferenceSet(*no_rows(2)), linear=True),
+    "R+L2": Task(DiagonalEllipse(ones, 0.05, 2), lambda w, theta: ReferenceSet(*no_rows(2), np.eye(2), 0.05)),
+    "R+O03": Task(WeightedL1(velocities, 0.3, 2), reference_l1(0.3), linear=True),
+    "R+O10": Task(WeightedL1(velocities, 1.0, 2), reference_l1(1.0), linear=True),
+    "R+O30": Task(WeightedL1(velocities, 3.0, 2), reference_l1(3.0), linear=True),
+    "R+M": Task(WeightedPositivePart(velocities, 1.0, 2), reference_positive(1.0), linear=True),
+    "R+T": Task(PlanarEllipse(tip_matrix, 0.05), reference_tip),
+    "HC+O": Task(WeightedL1(velocities, 20.0, 6), reference_l1(20.0), linear=True),
+    "HC+MA": Task(HalfSpace(leg_normal, 5.0, 6), reference_half_space, linear=True),
+    "H+M": Task(WeightedPositivePart(velocities, 10.0, 3), reference_positive(10.0), linear=True),
+    "H+O+S": Task(WeightedL1AndEllipse(velocities, 10.0, squared_sines, 0.1, 3), reference_both),
+    "W+M": Task(WeightedPositivePart(velocities, 10.0, 6), reference_positive(10.0), linear=True),
+    "W+O+S": Task(WeightedL1AndEllipse(velocities, 10.0, squared_sines, 0.1, 6), reference_both),
+    # Beyond the paper: an ellipse that the box cuts, with the degenerate angles below making some or all s_i = 0.
+    "cut ellipse": Task(
+        DiagonalEllipse(squared_sines, 0.4, 4),
+        lambda w, theta: ReferenceSet(*no_rows(4), np.diag(np.sin(theta) ** 2), 0.4),
+    ),
+}
+every_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS.keys())
+
+
+def sample_obs(task: Task, count: int, seed: int, largest: float = 1e6) -> Tensor:
+    """Observations (count, 2d): velocities from 0.1 to `largest`, some exactly 0; angles, some exactly 0 or pi."""
+    generator = torch.Generator().manual_seed(seed)
+    dim = task.constraint.dim
+    exponent = torch.tensor([-1.0, 0.0, 0.5, 1.0, 1.0, 1.5, math.log10(largest)])
+    scale = 10.0 ** exponent[torch.randint(len(exponent), (count, 1), generator=generator)]
+    w = torch.randn(count, dim, generator=generator) * scale
+    w = w * (torch.rand(count, dim, generator=generator) > 0.15)
+    theta = torch.randn(count, dim, generator=generator) * 2.0
+    special = torch.rand(count, dim, generator=generator)
+    theta = torch.where(special < 0.1, 0.0, torch.where(special < 0.2, math.pi, theta))
+    theta[: count // 20] = 0.0
+    w[count // 40 : count // 10] = 0.0
+    return torch.cat((w, theta), -1).double()
+
+
+def sample_action(task: Task, count: int, seed: int, scale: float = 1.0) -> Tensor:
+    generator = torch.Generator().manual_seed(1000 + seed)
+    return torch.randn(count, task.constraint.dim, generator=generator, dtype=torch.float64) * scale
+
+
+# ------------------------------------------------------------------------------------------ against other solvers
+
+
+@every_task
+def test_violation_and_penalty_are_the_definitions(task):
+    obs, action = sample_obs(task, 100, 0), sample_action(task, 100, 0)
+    violation, penalty = task.constraint.violation(obs, action), task.constraint.penalty(obs, action)
+    for k in range(len(obs)):
+        reference = task.reference_at(obs[k])
+        assert violation[k].item() == pytest.approx(reference.violation(action[k].numpy()), rel=1e-9, abs=1e-9)
+        assert penalty[k].item() == pytest.approx(reference.penalty(action[k].numpy()), rel=1e-9, abs=1e-9)
+
+
+@every_task
+@pytest.mark.parametrize("scale", [0.5, 1.5, 30.0])
+def test_projection_is_the_solver_s(task, scale):
+    obs, action = sample_obs(task, 60, 1), sample_action(task, 60, 1, scale)
+    projected = task.constraint.project(obs, action)
+    for k in range(len(obs)):
+        reference, a, p = task.reference_at(obs[k]), action[k].numpy(), projected[k].numpy()
+        np.testing.assert_allclose(p, reference.project(a), atol=1e-4)
+        assert reference.violation(p) <= 1e-12
+        assert reference.normal_cone_residual(p, a - p) <= 1e-10 * scale
+
+
+@every_task
+def test_oracle_attains_the_solver_s_value(task):
+    obs, gradient = sample_obs(task, 80, 2), sample_action(task, 80, 2)
+    best = task.constraint.linear_oracle(obs, gradient)
+    for k in range(len(obs)):
+        reference, g, p = task.reference_at(obs[k]), gradient[k].numpy(), best[k].numpy()
+        assert g @ p == pytest.approx(g @ reference.linear_oracle(g), abs=1e-7)
+        assert reference.violation(p) <= 1e-12
+        assert reference.normal_cone_residual(p, g) <= 1e-9
+
+
+@every_task
+def test_center_is_chebyshev_s_or_the_origin(task):
+    obs = sample_obs(task, 80, 3)
+    center = task.constraint.center(obs)
+    if task.constraint.origin_centered:
+        assert torch.equal(center, torch.zeros_like(center))
+    if not task.linear:
+        assert task.constraint.origin_centered
+        return
+    for k in range(len(obs)):
+        # A centre of radius r keeps the violation, which has unit rows, below -r. Zero rows have no distance.
+        reference = task.reference_at(obs[k])
+        kept = np.linalg.norm(reference.rows, axis=1) > 0.0
+        reference = ReferenceSet(reference.rows[kept], reference.bounds[kept])
+        assert -reference.violation(center[k].numpy()) == pytest.approx(reference.chebyshev_radius(), abs=1e-9)
+
+
+# ------------------------------------------------------------------------------------------ gauge and the maps
+
+
+def interior_point(task: Task, obs: Tensor, seed: int) -> Tensor:
+    """Any interior points (..., d), not the centre."""
+    point = task.constraint.radial_map(obs, sample_action(task, len(obs), seed))
+    return 0.9 * point
+
+
+@every_task
+@pytest.mark.parametrize("off_center", [False, True])
+def test_gauge_reaches_the_boundary(task, off_center):
+    obs, direction = sample_obs(task, 200, 4), sample_action(task, 200, 4)
+    direction[:20, 0] = 0.0
+    direction[10:30] *= 1e30
+    direction[30:40] *= 1e-30
+    center = interior_point(task, obs, 5) if off_center else task.constraint.center(obs)
+    gauge = task.constraint.gauge(obs, direction, center)
+    boundary = center + direction / gauge.unsqueeze(-1)
+    for k in range(len(obs)):
+        assert task.reference_at(obs[k]).violation(boundary[k].numpy()) == pytest.approx(0.0, abs=1e-9)
+    ones = torch.ones(len(obs), dtype=torch.float64)
+    torch.testing.assert_close(task.constraint.gauge(obs, boundary - center, center), ones, rtol=1e-7, atol=0.0)
+    torch.testing.assert_close(task.constraint.gauge(obs, 3.0 * direction, center), 3.0 * gauge, rtol=1e-12, atol=0.0)
+    if not off_center and task.constraint.origin_centered:
+        torch.testing.assert_close(task.constraint.gauge(obs, direction, None), gauge, rtol=1e-12, atol=0.0)
+
+
+@every_task
+def test_large_directions_stay_finite_in_float32(task):
+    obs = sample_obs(task, 50, 6).float()
+    action = sample_action(task, 50, 6).float() * 1e30
+    for mapped in (task.constraint.alpha_map(obs, action), task.constraint.radial_map(obs, action)):
+        violation = task.constraint.violation(obs.double(), mapped.double())
+        assert violation.abs().max() < 1e-6  # on the boundary
+
+
+@every_task
+def test_alpha_map_keeps_feasible_points_and_stops_at_the_boundary(task):
+    obs, action = sample_obs(task, 200, 7), sample_action(task, 200, 7)
+    action[::2] *= 0.2
+    mapped = task.constraint.alpha_map(obs, action)
+    feasible = task.constraint.violation(obs, action) <= 0.0
+    assert 0 < feasible.sum() < len(obs)
+    torch.testing.assert_close(mapped[feasible], action[feasible], rtol=0.0, atol=1e-15)
+    torch.testing.assert_close(
+        task.constraint.violation(obs, mapped)[~feasible],
+        torch.zeros(int((~feasible).sum()), dtype=torch.float64),
+        rtol=0.0,
+        atol=1e-9,
+    )
+    center = task.constraint.center(obs)
+    moved, asked = mapped - center, action - center
+    cosine = torch.nn.functional.cosine_similarity(moved, asked, dim=-1)
+    torch.testing.assert_close(cosine, torch.ones_like(cosine))
+
+
+@every_task
+def test_radial_map_is_the_paper_s_formula(task):
+    obs, action = sample_obs(task, 100, 8, largest=100.0), sample_action(task, 100, 8)
+    center = task.constraint.center(obs)
+    offset = action - center
+    boundary = center + offset / task.constraint.gauge(obs, offset, center).unsqueeze(-1)
+    ratio = offset.norm(dim=-1) / (boundary - center).norm(dim=-1)
+    expected = center + ratio.tanh().unsqueeze(-1) * (boundary - center)
+    torch.testing.assert_close(task.constraint.radial_map(obs, action), expected, rtol=1e-10, atol=1e-12)
+
+
+@every_task
+def test_radial_map_s_jacobian_at_the_center_is_the_identity(task):
+    obs = sample_obs(task, 8, 9, largest=100.0)[4:]
+    for k in range(len(obs)):
+        center = task.constraint.center(obs[k])
+        jacobian = torch.autograd.functional.jacobian(lambda a, k=k: task.constraint.radial_map(obs[k], a), center)
+        torch.testing.assert_close(jacobian, torch.eye(task.constraint.dim, dtype=torch.float64))
+
+
+@every_task
+def test_radial_log_prob_is_the_jacobian_s_determinant(task):
+    obs, action = sample_obs(task, 20, 10, largest=30.0), sample_action(task, 20, 10, 0.7)
+    log_prob = torch.linspace(-1.0, 1.0, 20, dtype=torch.float64)
+    got = task.constraint.radial_log_prob(obs, action, log_prob)
+    for k in range(len(obs)):
+        jacobian = torch.autograd.functional.jacobian(lambda a, k=k: task.constraint.radial_map(obs[k], a), action[k])
+        # Past L = 6 or so the determinant itself loses digits; the formula does not.
+        if jacobian.det().abs() > 1e-6:
+            expected = log_prob[k] - jacobian.det().abs().log()
+            torch.testing.assert_close(got[k], expected, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["R+N", "R+L2", "R+O10", "R+M", "R+T"])
+def test_alpha_log_prob_has_mass_one(name):
+    constraint = TASKS[name].constraint
+    obs = torch.tensor([2.0, 1.5, 0.3, 0.8], dtype=torch.float64)
+    mean = torch.tensor([0.2, -0.3], dtype=torch.float64)
+    std = torch.tensor([0.5, 0.3], dtype=torch.float64)
+    center = constraint.center(obs)
+    count = 20000
+    angle = (torch.arange(count, dtype=torch.float64) + 0.5) * (2.0 * math.pi / count)
+    ray = torch.stack((angle.cos(), angle.sin()), -1)
+    radius = 1.0 / constraint.gauge(obs, ray, center)
+    # Interior, in polar coordinates around the centre.
+    fraction = (torch.arange(200, dtype=torch.float64) + 0.5) / 200
+    coarse, reach = ray[::20], radius[::20]
+    inside = center + fraction[:, None, None] * reach[:, None] * coarse
+    density = constraint.alpha_log_prob(obs, inside, mean, std).exp()
+    interior = (density * fraction[:, None] * reach**2).mean(0).mean() * 2.0 * math.pi
+    # Boundary: each segment of the polygon through the boundary points carries the density at its ends.
+    boundary = center + radius[:, None] * ray
+    beyond = center + 1.5 * radius[:, None] * ray  # any action on the ray past the boundary maps to it
+    surface = constraint.alpha_log_prob(obs, beyond, mean, std).exp()
+    length = (boundary.roll(-1, 0) - boundary).norm(dim=-1)
+    mass = interior + (0.5 * (surface + surface.roll(-1, 0)) * length).sum()
+    assert mass.item() == pytest.approx(1.0, abs=1e-3)
+
+
+# ------------------------------------------------------------------------------------------ gradients
+
+
+@every_task
+@pytest.mark.parametrize("scale", [0.4, 2.0])
+def test_gradients_are_exact(task, scale):
+    obs = sample_obs(task, 24, 11, largest=30.0)
+    action = sample_action(task, 24, 11, scale).requires_grad_()
+    std = torch.full_like(action, 0.5)
+    for function in (
+        task.constraint.project,
+        task.constraint.alpha_map,
+        task.constraint.radial_map,
+        lambda o, a: task.constraint.gauge(o, a, interior_point(task, o, 12)),
+        lambda o, a: task.constraint.radial_log_prob(o, a, a.sum(-1)),
+        lambda o, a: task.constraint.alpha_log_prob(o, a, torch.zeros_like(a), std),
+        task.constraint.penalty,
+    ):
+        assert torch.autograd.gradcheck(lambda a, f=function: f(obs, a), action, atol=1e-5, rtol=1e-4)
+
+
+@every_task
+def test_gradients_are_finite_where_the_functions_have_kinks(task):
+    obs = sample_obs(task, 100, 13)
+    for action in (torch.zeros(100, task.constraint.dim).double(), task.constraint.center(obs), torch.ones_like(obs)):
+        action = action[..., : task.constraint.dim].clone().requires_grad_()
+        std = torch.full_like(action, 0.5)
+        values = (
+            task.constraint.project(obs, action),
+            task.constraint.alpha_map(obs, action),
+            task.constraint.radial_map(obs, action),
+            task.constraint.penalty(obs, action),
+            task.constraint.violation(obs, action),
+            task.constraint.gauge(obs, action, None),
+            task.constraint.radial_log_prob(obs, action, action.sum(-1)),
+            task.constraint.alpha_log_prob(obs, action, torch.zeros_like(action), std),
+        )
+        for value in values:
+            (gradient,) = torch.autograd.grad(value.sum(), action)
+            assert value.isfinite().all() and gradient.isfinite().all()
+
+
+@every_task
+def test_projection_inside_has_the_identity_as_jacobian(task):
+    obs = sample_obs(task, 50, 14)
+    action = (0.5 * interior_point(task, obs, 14)).requires_grad_()
+    weights = sample_action(task, 50, 15)
+    action.data[:10] = 0.0
+    inside = task.constraint.violation(obs, action.detach()) < 0.0
+    assert inside.all()
+    (gradient,) = torch.autograd.grad((weights * task.constraint.project(obs, action)).sum(), action)
+    torch.testing.assert_close(gradient, weights)
+
+
+# ------------------------------------------------------------------------------------------ any input
+
+
+@every_task
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10**6),
+    reach=st.sampled_from([0.0, 1e-3, 0.1, 1.0, 3.0, 1e3, 1e6]),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+def test_every_point_is_feasible(task, seed, reach, dtype):
+    obs = sample_obs(task, 40, seed).to(dtype)
+    action = sample_action(task, 40, seed, reach).to(dtype)
+    tolerance = 1e-6 if dtype == torch.float32 else 1e-9
+    projected = task.constraint.project(obs, action)
+    for point in (
+        projected,
+        task.constraint.alpha_map(obs, action),
+        task.constraint.radial_map(obs, action),
+        task.constraint.linear_oracle(obs, action),
+        task.constraint.center(obs),
+    ):
+        assert point.dtype == dtype
+        assert task.constraint.violation(obs.double(), point.double()).max() <= tolerance
+    # A projection leaves feasible points alone and brings no two points further apart.
+    again = task.constraint.project(obs, projected)
+    torch.testing.assert_close(again, projected, rtol=0.0, atol=tolerance)
+    other = sample_action(task, 40, seed + 1, reach).to(dtype)
+    apart = (task.constraint.project(obs, other) - projected).norm(dim=-1)
+    assert (apart <= (other - action).norm(dim=-1) * (1.0 + 1e-5) + tolerance).all()
+
+
+@every_task
+def test_float32_agrees_with_float64(task):
+    obs, action = sample_obs(task, 200, 16, largest=30.0).float(), sample_action(task, 200, 16).float()
+    for function in (
+        task.constraint.project,
+        task.constraint.alpha_map,
+        task.constraint.radial_map,
+        task.constraint.violation,
+        task.constraint.penalty,
+        task.constraint.linear_oracle,
+    ):
+        single, double = function(obs, action), function(obs.double(), action.double())
+        torch.testing.assert_close(single.double(), double, rtol=1e-5, atol=1e-5)
+
+
+@every_task
+@pytest.mark.parametrize("speed", [0.0, 1e-12, 1e6])
+@pytest.mark.parametrize("angle", [0.0, math.pi, math.pi + 1e-8, 0.7])
+def test_degenerate_states(task, speed, angle):
+    dim = task.constraint.dim
+    w = torch.full((dim,), speed).double() * torch.tensor([(-1.0) ** k for k in range(dim)]).double()
+    obs = torch.cat((w, torch.full((dim,), angle).double()))
+    reference = task.reference_at(obs)
+    for seed in range(4):
+        action = sample_action(task, 1, seed, 2.0)[0]
+        projected, best = task.constraint.project(obs, action), task.constraint.linear_oracle(obs, action)
+        assert reference.violation(projected.numpy()) <= 1e-9
+        assert reference.violation(best.numpy()) <= 1e-9
+        assert reference.normal_cone_residual(projected.numpy(), (action - projected).numpy()) <= 1e-7
+        assert reference.normal_cone_residual(best.numpy(), action.numpy()) <= 1e-7
+        assert reference.violation(task.constraint.radial_map(obs, action).numpy()) <= 1e-9
+
+
+@every_task
+def test_leading_shapes(task):
+    constraint, dim = task.constraint, task.constraint.dim
+    obs, action = sample_obs(task, 12, 17), sample_action(task, 12, 17)
+    std = torch.full_like(action, 0.5)
+    functions = {
+        "project": constraint.project,
+        "alpha_map": constraint.alpha_map,
+        "radial_map": constraint.radial_map,
+        "linear_oracle": constraint.linear_oracle,
+        "violation": constraint.violation,
+        "penalty": constraint.penalty,
+        "gauge": lambda o, a: constraint.gauge(o, a, None),
+        "radial_log_prob": lambda o, a: constraint.radial_log_prob(o, a, a.sum(-1)),
+        "alpha_log_prob": lambda o, a: constraint.alpha_log_prob(o, a, torch.zeros(dim).double(), std[0]),
+    }
+    for name, function in functions.items():
+        flat = function(obs, action)
+        stacked = function(obs.view(3, 4, -1), action.view(3, 4, dim))
+        torch.testing.assert_close(stacked.flatten(0, 1), flat, rtol=0.0, atol=1e-12, msg=name)
+        one = function(obs[5], action[5])
+        torch.testing.assert_close(one, flat[5], rtol=0.0, atol=1e-12, msg=name)
+        shared_obs = function(obs[0], action)
+        torch.testing.assert_close(shared_obs, function(obs[:1].expand(12, -1), action), msg=name)
+        shared_action = function(obs, action[0])
+        torch.testing.assert_close(shared_action, function(obs, action[:1].expand(12, -1)), msg=name)
+        empty = function(obs[:0], action[:0])
+        assert empty.shape == (0, *flat.shape[1:]), name
+    assert constraint.center(obs[0]).shape == (dim,)
+    assert constraint.center(obs.view(3, 4, -1)).shape == (3, 4, dim)
+    assert constraint.center(obs[:0]).shape == (0, dim)
+
+
+@every_task
+def test_nan_is_passed_on(task):
+    obs, action = sample_obs(task, 40, 18), sample_action(task, 40, 18)
+    action[::2, 0] = math.nan
+    action[1::4, -1] = math.nan
+    bad = action.isnan().any(-1)
+    for function in (task.constraint.project, task.constraint.alpha_map, task.constraint.radial_map):
+        mapped = function(obs, action)
+        assert mapped.isnan().all(-1)[bad].all()
+        assert mapped[~bad].isfinite().all()
+    assert task.constraint.violation(obs, action)[bad].isnan().all()
+    assert task.constraint.penalty(obs, action)[bad].isnan().all()
+    assert task.constraint.linear_oracle(obs, action)[bad].isnan().all()
+
+
+@pytest.mark.parametrize("name", ["R+M", "H+M", "W+M"])
+def test_center_is_continuous(name):
+    """Along a path on which weights change sign, one after the other and then all at once."""
+    constraint = TASKS[name].constraint
+    dim = constraint.dim
+    time = torch.linspace(-1.0, 1.0, 20001).double().unsqueeze(-1)
+    w = 12.0 * (time * torch.linspace(1.0, 2.0, dim) + 0.3 * torch.arange(dim) * (time.abs() > 0.0)).double()
+    for path in (12.0 * time * torch.linspace(1.0, 2.0, dim), w):
+        center = constraint.center(torch.cat((path, torch.zeros_like(path)), -1))
+        step = (path[1:] - path[:-1]).norm(dim=-1)
+        assert ((center[1:] - center[:-1]).norm(dim=-1) <= step + 1e-12).all()
+
+
+def test_center_of_a_free_set_is_the_origin():
+    for name in ("R+M", "H+M", "W+M", "HC+MA"):
+        constraint = TASKS[name].constraint
+        assert torch.equal(constraint.center(torch.zeros(2 * constraint.dim)), torch.zeros(constraint.dim))
+
+
+def test_wrong_arguments_are_refused():
+    with pytest.raises(ValueError, match="bound"):
+        WeightedL1(velocities, 0.0, 2)
+    with pytest.raises(ValueError, match="bound"):
+        DiagonalEllipse(ones, -1.0, 2)
+    with pytest.raises(ValueError, match="bound"):
+        PlanarEllipse(tip_matrix, 0.0)
+    with pytest.raises(ValueError, match="dim"):
+        Box(0)
+    with pytest.raises(ValueError, match="coordinates"):
+        Box(2).project(torch.zeros(4), torch.zeros(3))

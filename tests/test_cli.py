@@ -1,0 +1,169 @@
+"""run.py from the command line: usage, wrong input, results, and interrupts."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+import run
+from algos import ALGORITHMS
+from core.config import HYPERPARAMETERS, Config, ConfigError, parse_seeds
+from core.results import read_run
+from envs import TASKS
+
+ROOT = Path(__file__).parents[1]
+SHORT = ["steps=40", "learning_starts=20", "batch_size=8", "hidden=[16,16]", "eval_episodes=1", "final_episodes=2"]
+
+
+def python(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=120, **options
+    )
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_usage_names_every_algorithm_task_and_key(capsys, arguments):
+    assert run.main(arguments) == 0
+    out = capsys.readouterr().out
+    for name in [*ALGORITHMS, *TASKS, *Config.__dataclass_fields__]:
+        assert name in out
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        ("algo=SRad", "env= is missing"),
+        ("env=W+M", "algo= is missing"),
+        ("algo=SRat env=W+M", "did you mean SRad?"),
+        ("algo=SRad env=w+m", "did you mean W+M?"),
+        ("algo=SRad env=X", "choices: R+N"),
+        ("algo=SRad,Foo env=W+M", "'Foo'"),
+        ("algo=SRad env=W+M sed=3", "did you mean seed?"),
+        ("algo=SRad env=W+M seed", "expected key=value, got 'seed'"),
+        ("algo=SRad env=W+M seed=", "expected key=value"),
+        ("algo=SRad env=W+M seed=x", "bad seed 'x'"),
+        ("algo=SRad env=W+M seed=5-2", "is empty"),
+        ("algo=SRad env=W+M seed=-1", "bad seed '-1'"),
+        ("algo=SRad env=W+M seed=1 seed=2", "given twice"),
+        ("algo=SRad env=W+M steps=ten", "bad value 'ten' for steps: expected int"),
+        ("algo=SRad env=W+M steps=0", "at least 1"),
+        ("algo=SRad env=W+M steps=1.5", "bad value '1.5' for steps"),
+        ("algo=SRad env=W+M gamma=2", "in [0, 1]"),
+        ("algo=SRad env=W+M gamma=nan", "must be finite"),
+        ("algo=SRad env=W+M tau=0", "in (0, 1]"),
+        ("algo=SRad env=W+M learning_rate=-1", "must be positive"),
+        ("algo=SRad env=W+M hidden=[]", "positive widths"),
+        ("algo=SRad env=W+M hidden=[a]", "bad value '[a]' for hidden"),
+        ("algo=SRad env=W+M train_freq=never", "steps or 'episode'"),
+        ("algo=SRad env=W+M gradient_steps=-2", "-1 or at least 1"),
+        ("algo=SRad env=W+M batch_size=null", "a value is needed"),
+        ("algo=SRad env=W+M action_noise=0.1", "does not apply to SRad"),
+        ("algo=DPre env=W+M penalty=2", "does not apply to DPre"),
+        ("algo=DPre env=W+M fw_learning_rate=0.1", "does not apply to DPre"),
+        ("algo=SRad env=W+M device=tpu", "must be cpu or cuda"),
+        ("algo=SRad env=W+M overwrite=maybe", "bad value 'maybe' for overwrite"),
+    ],
+)
+def test_wrong_input_gets_one_line_and_exit_code_2(capsys, tmp_path, words, said):
+    assert run.main([*words.split(), f"results={tmp_path}"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and said in captured.err and captured.err.startswith("run.py: ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_results_folder_that_cannot_be_made(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert run.main(["algo=DPre", "env=R+N", f"results={tmp_path / 'file'}", *SHORT]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_numbers_as_people_write_them():
+    ((config, _),) = run.plan(["algo=SRad", "env=W+M", "steps=3e5", "hidden=64,32", "learning_rate=1e-3"])
+    assert (config.steps, config.hidden, config.learning_rate) == (300_000, [64, 32], 1e-3)
+
+
+def test_seeds():
+    assert parse_seeds("3") == [3]
+    assert parse_seeds("0-4,7,2") == [0, 1, 2, 3, 4, 7]
+    with pytest.raises(ConfigError):
+        parse_seeds("1;2")
+
+
+def test_lists_and_all_make_the_product():
+    cells = run.plan(["algo=DRad,DPre", "env=all"])
+    assert len(cells) == 2 * len(TASKS)
+    # A key of some algorithms only goes to those.
+    by_name = {config.algo: config for config, _ in run.plan(["algo=all", "env=R+N", "fw_learning_rate=0.5"])}
+    assert by_name["NFW"].fw_learning_rate == 0.5 and by_name["DPre"].fw_learning_rate is None
+
+
+def test_the_papers_hyperparameters():
+    """Spot checks of Table "Hyperparameters used in the experiments", through the resolution of cells."""
+    cells = {(c.algo, c.env): c for c, _ in run.plan(["algo=all", "env=all"])}
+    assert len(cells) == 169
+    nfw, srad = cells["NFW", "R+L2"], cells["SRad", "R+L2"]
+    assert (nfw.gamma, nfw.batch_size, nfw.buffer_size, nfw.fw_learning_rate) == (0.98, 100, 200_000, 0.05)
+    assert (nfw.train_freq, nfw.gradient_steps, nfw.steps, nfw.action_noise) == ("episode", -1, 300_000, 0.1)
+    assert (srad.tau, srad.learning_rate, srad.gsde, srad.train_freq, srad.gradient_steps) == (
+        0.02,
+        7.3e-4,
+        True,
+        "8",
+        8,
+    )
+    hopper = cells["DPre+", "H+M"]
+    assert (hopper.batch_size, hopper.learning_rate, hopper.train_freq, hopper.penalty) == (256, 3e-4, "1", 1.0)
+    walker = cells["SAlpha", "W+O+S"]
+    assert (walker.hidden, walker.tau, walker.gsde, walker.steps) == ([256, 256], 0.005, False, 1_000_000)
+    assert all(row["learning_starts"] == 100_000 for row in HYPERPARAMETERS.values())
+
+
+def test_a_run_from_the_shell_and_what_it_leaves(tmp_path):
+    words = ["algo=SRad", "env=R+L2", "seed=4,6", f"results={tmp_path}", *SHORT]
+    done = python("run.py", *words)
+    assert done.returncode == 0, done.stderr
+    assert "training" in done.stderr and done.stdout.count("return ") == 2
+    variant = "SRad,batch_size=8,eval_episodes=1,final_episodes=2,hidden=[16,16],learning_starts=20,steps=40"
+    for seed in (4, 6):
+        finished = read_run(tmp_path / "R+L2" / variant / f"seed={seed}")
+        assert finished.finished and len(finished.result["returns"]) == 2
+        assert finished.config["seed"] == str(seed) and finished.config["tau"] == 0.02
+        assert finished.evaluations.step.tolist() == [40]
+        assert {p.name for p in finished.folder.iterdir()} >= {"best.pt", "last.pt", "info.json"}
+        seconds = finished.result["seconds"]
+        assert set(seconds) == {"environment", "map", "update", "evaluation", "total"}
+        assert 0 < sum(seconds.values()) - seconds["total"] <= seconds["total"]
+
+    again = python("run.py", *words)
+    assert again.returncode == 0 and again.stdout.count("already finished") == 2
+    before = (finished.folder / "result.json").read_bytes()
+    assert python("run.py", *words, "overwrite=true").returncode == 0
+    assert (finished.folder.parent / "seed=6.old-1" / "result.json").read_bytes() == before
+
+    plot = python("plot.py", str(tmp_path))
+    assert plot.returncode == 0, plot.stderr
+    assert "SRad" in plot.stdout and list((tmp_path / "figures").glob("*.png"))
+
+
+def test_an_interrupt_leaves_a_usable_state(tmp_path):
+    words = ["algo=DPre", "env=R+N", "learning_starts=10", "batch_size=8", "eval_every=20", "eval_episodes=1"]
+    process = subprocess.Popen(
+        [sys.executable, "run.py", *words, f"results={tmp_path}"],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob("*/*/seed=0/best.pt")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in err and "interrupted" in err
+    (folder,) = tmp_path.glob("*/*/seed=0")
+    assert (folder / "last.pt").is_file() and not (folder / "result.json").exists()
+    assert len(read_run(folder).evaluations.step) >= 1
+    assert yaml.safe_load((folder / "config.yaml").read_text())["algo"] == "DPre"

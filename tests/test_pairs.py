@@ -1,0 +1,49 @@
+"""Every algorithm on every task: it trains, it moves its parameters, and it executes feasible actions only."""
+
+import json
+
+import pytest
+import torch
+
+import run
+from algos import ALGORITHMS
+from core.config import parse_seeds
+from envs import TASKS
+
+SHORT = ["learning_starts=20", "batch_size=8", "hidden=[16,16]", "eval_episodes=1", "final_episodes=1"]
+
+
+def steps_needed(algo, task):
+    """Long enough for gradient steps: TD3 outside Hopper waits for the end of an episode."""
+    robot = TASKS[task].robot.__name__
+    per_episode = ALGORITHMS[algo].base == "TD3" and robot != "Hopper"
+    return {"Reacher": 151, "HalfCheetah": 1001, "Walker2d": 120}.get(robot, 40) if per_episode else 40
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_pair(tmp_path, capsys, algo, task):
+    steps = steps_needed(algo, task)
+    words = [f"algo={algo}", f"env={task}", "seed=0", f"steps={steps}", f"results={tmp_path}", *SHORT]
+    assert run.main(words) == 0
+    (folder,) = tmp_path.glob("*/*/seed=0")
+    result = json.loads((folder / "result.json").read_text())
+    assert result["largest_violation"] <= 1e-6
+    assert result["executed_actions"] >= steps + 2 and result["steps"] == steps
+    assert result["gradient_steps"] > 0
+    assert str(folder) in capsys.readouterr().out
+
+    last = torch.load(folder / "last.pt", weights_only=True)
+    assert all(parameter.isfinite().all() for parameter in last.values())
+    target = {name: p for name, p in last.items() if name.startswith("critic_target")}
+    assert any(not torch.equal(p, last[name.replace("_target", "")]) for name, p in target.items())
+
+
+def test_every_executed_action_is_counted(tmp_path):
+    """The counts of training and evaluation environments add up: nothing is executed unchecked."""
+    words = ["algo=DPre", "env=R+M", "seed=0-1", "steps=150", f"results={tmp_path}", *SHORT]
+    assert run.main([*words, "eval_every=50"]) == 0
+    for seed in parse_seeds("0-1"):
+        (path,) = tmp_path.glob(f"*/*/seed={seed}/result.json")
+        # 150 training steps, three evaluations and the final one of an episode each
+        assert json.loads(path.read_text())["executed_actions"] == 150 + (3 + 1) * 150

@@ -33,16 +33,21 @@ class DiagonalEllipse(Constraint):
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         return self._violation(obs, action).clamp(min=0.0)
 
-    def _solve(self, obs: Tensor, target: Tensor, shift: float):
-        def clipped(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _solve(self, obs: Tensor, target: Tensor, shift: float) -> tuple[Tensor, Tensor]:
+        def clipped(metric: Tensor) -> tuple[Tensor, Tensor, None]:
             solution = (target / metric.clamp(min=1e-300)).clamp(-1.0, 1.0)
-            return solution, (solution.abs() < 1.0).double(), torch.zeros_like(solution)
+            return solution, solution.abs() < 1.0, None
 
         return minimize_under_ellipse(clipped, target, shift, self.scale(obs), self.bound)
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        solution, curvature, normals = self._solve(obs, action, 1.0)
-        return self._pull_in(obs, solution), deflated_jacobian(curvature, *normals)
+        solution, mu = self._solve(obs, action, 1.0)
+        curvature = (solution.abs() < 1.0) / (1.0 + mu * self.scale(obs))
+        return self._pull_in(obs, solution), deflated_jacobian(curvature, self.normal(obs, solution, mu))
+
+    def normal(self, obs: Tensor, solution: Tensor, mu: Tensor) -> Tensor:
+        """Normal (..., d) of the ellipse where its multiplier says that it is active, 0 elsewhere."""
+        return torch.where(mu > 0.0, self.scale(obs) * solution, 0.0)
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         return self._pull_in(obs, self._solve(obs, gradient, 0.0)[0])
@@ -120,11 +125,11 @@ class PlanarEllipse(Constraint):
         scale = torch.stack((mean + spread, (mean - spread).clamp(min=0.0)), -1)
         target = _times(axes.mT, action)
 
-        def unbounded(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            return target / metric, torch.ones_like(metric), torch.zeros_like(metric)
+        def unbounded(metric: Tensor) -> tuple[Tensor, Tensor, None]:
+            return target / metric, torch.ones_like(metric), None
 
-        solution, curvature, normals = minimize_under_ellipse(unbounded, target, 1.0, scale, self.bound)
-        jacobian = deflated_jacobian(curvature, *normals)
+        solution, mu = minimize_under_ellipse(unbounded, target, 1.0, scale, self.bound)
+        jacobian = deflated_jacobian(1.0 / (1.0 + mu * scale), torch.where(mu > 0.0, scale * solution, 0.0))
         return _times(axes, solution), lambda vector: _times(axes, jacobian(_times(axes.mT, vector)))
 
     def _face_intervals(self, matrix: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,8 +14,8 @@ from constraints.base import (
     largest_gauge,
 )
 from constraints.ellipse import DiagonalEllipse
-from constraints.separable import minimize_under_ellipse, minimize_under_row
-from constraints.weighted import WeightedL1, row_free
+from constraints.separable import RowProblem, minimize_under_ellipse
+from constraints.weighted import WeightedL1
 
 
 class WeightedL1AndEllipse(Constraint):
@@ -35,22 +35,26 @@ class WeightedL1AndEllipse(Constraint):
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         return self.l1._penalty(obs, action) + self.ellipse._penalty(obs, action)
 
-    def _solve(self, obs: Tensor, target: Tensor, shift: float):
-        weight, bound = self.l1.scaled_weight(obs)
-        row, low, high = self.l1._orthant(weight, target)
+    def _solve(self, obs: Tensor, target: Tensor, shift: float) -> tuple[RowProblem, Tensor, Tensor]:
+        problem = self.l1.row_problem(obs, target)
 
         def under_row(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            solution, active = minimize_under_row(target, metric, row, bound, low, high)
-            return solution, row_free(solution, row, active, low, high), row * active
+            solution, active = problem.solve(metric)
+            return solution, (solution > problem.low) & (solution < problem.high), problem.row * active
 
-        return minimize_under_ellipse(under_row, target, shift, self.ellipse.scale(obs), self.ellipse.bound)
+        solution, mu = minimize_under_ellipse(under_row, target, shift, self.ellipse.scale(obs), self.ellipse.bound)
+        return problem, solution, mu
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        solution, curvature, normals = self._solve(obs, action, 1.0)
+        problem, solution, mu = self._solve(obs, action, 1.0)
+        metric = 1.0 + mu * self.ellipse.scale(obs)
+        solution, active = problem.solve(metric)
+        curvature = problem.free(solution, active) / metric
+        normals = problem.row * active, self.ellipse.normal(obs, solution, mu)
         return self._pull_in(obs, solution), deflated_jacobian(curvature, *normals)
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        return self._pull_in(obs, self._solve(obs, gradient, 0.0)[0])
+        return self._pull_in(obs, self._solve(obs, gradient, 0.0)[1])
 
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         return largest_gauge(

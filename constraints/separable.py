@@ -1,4 +1,7 @@
-"""Scalar dual problems behind the closed forms: one row or one diagonal ellipse over a box, in batch."""
+"""Scalar dual problems behind the closed forms: one row or one diagonal ellipse over a box, in batch.
+
+Both minimise sum(metric a^2 / 2 - target a): metric 1 gives a projection, metric 0 a linear oracle.
+"""
 
 from __future__ import annotations
 
@@ -7,90 +10,105 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from constraints.base import deflated_jacobian
-
 _TINY = 1e-300
-_HUGE = 1e300
+_HUGE = 1e150
+_JUST_BELOW = 1.0 - 2.0**-52
 # Newton needs 4 to 10 steps, rows with tied or degenerate gradients up to 30.
 _MAX_STEPS = 40
 
 
-def minimize_under_row(
-    target: Tensor, metric: Tensor, row: Tensor, bound: Tensor, low: Tensor, high: Tensor
-) -> tuple[Tensor, Tensor]:
-    """argmin (..., d) of sum(metric a^2 / 2 - target a) subject to row.a <= bound and low <= a <= high.
+class RowProblem:
+    """min sum(metric a^2 / 2 - target a) subject to row.a <= bound and low <= a <= high, for any metric >= 0.
 
-    metric (..., d) >= 0: ones give a projection, zeros a continuous knapsack. bound (..., 1) must be attainable.
-    Also returns whether the row holds the solution back (..., 1).
+    All (..., d), bound (..., 1), which must be attainable. low and high do not cross 0 where the constraint has a kink.
 
     With a multiplier lam on the row, each coordinate stays at one end of its range until lam reaches `leave`, moves
     linearly, and stays at the other end from `arrive` on; where metric is 0 it jumps. row.a falls along lam, so the
-    solution lies between the two of the 2d breakpoints whose row.a enclose the bound. Breakpoints at the same lam but
-    on either side of a jump count as two, so that the jump is interpolated like a move.
+    solution lies between the two of the 2d breakpoints whose row.a enclose the bound. The breakpoints `leave` are
+    taken just before their value, so that a jump is interpolated like a move.
     """
-    free = (target / metric.clamp(min=_TINY)).clamp(low, high)
-    moving = row != 0.0
-    first = torch.where(moving, torch.where(row > 0.0, high, low), free)
-    last = torch.where(moving, torch.where(row > 0.0, low, high), free)
-    slope = torch.where(moving, row, 1.0)
-    leave = ((target - metric * first) / slope).clamp(-_HUGE, _HUGE)
-    arrive = ((target - metric * last) / slope).clamp(-_HUGE, _HUGE)
-    width = (arrive - leave).clamp(min=_TINY).unsqueeze(-2)
-    leaving = torch.nn.functional.pad(leave, (1, 0)).clamp(min=0.0).unsqueeze(-1)  # lam = 0 comes first
-    arriving = arrive.clamp(min=0.0).unsqueeze(-1)
-    before = ((leaving - leave.unsqueeze(-2)) / width).clamp(0.0, 1.0)
-    after = 1.0 - ((arrive.unsqueeze(-2) - arriving) / width).clamp(0.0, 1.0)
-    travelled = torch.cat((before, after), -2)  # (..., 2d + 1, d)
 
-    value = (row * first).sum(-1, keepdim=True)
-    value = value + (travelled * (row * (last - first)).unsqueeze(-2)).sum(-1)  # row.a at each breakpoint
-    active = value[..., :1] > bound
-    above, upper = torch.where(value >= bound, value, torch.inf).min(-1, keepdim=True)
-    below, lower = torch.where(value <= bound, value, -torch.inf).max(-1, keepdim=True)
-    gap = above - below
-    share = torch.where(gap > 0.0, (above - bound) / gap, 0.0)
-    start, end = (travelled.take_along_dim(index.unsqueeze(-1), -2).squeeze(-2) for index in (upper, lower))
-    solution = first + (start + share * (end - start)) * (last - first)
-    return torch.where(active, solution, free), active
+    def __init__(self, target: Tensor, row: Tensor, bound: Tensor, low: Tensor, high: Tensor):
+        self.target, self.row, self.bound, self.low, self.high = target, row, bound, low, high
+        self._moving = row != 0.0
+        falling = row > 0.0
+        self._last = torch.where(falling, low, high)
+        self._way_back = torch.where(falling, high, low) - self._last
+        slope = torch.where(self._moving, row, 1.0)
+        self._target_turn = (target / slope).clamp(-_HUGE, _HUGE)
+        self._last_turn = (self._last / slope).clamp(-_HUGE, _HUGE)
+        self._way_turn = (self._way_back / slope).clamp(-_HUGE, _HUGE)
+        self._drop = (row * self._way_back).unsqueeze(-1)
+        self._lowest = (row * self._last).sum(-1, keepdim=True)
+
+    def solve(self, metric: Tensor) -> tuple[Tensor, Tensor]:
+        """The solution (..., d) and whether the row holds it back (..., 1)."""
+        free = torch.clamp(self.target / metric.clamp(min=_TINY), self.low, self.high)
+        arrive = torch.addcmul(self._target_turn, metric, self._last_turn, value=-1.0)
+        width = metric * self._way_turn
+        leave = arrive - width
+        turns = torch.cat((torch.zeros_like(self._lowest), leave * _JUST_BELOW, arrive), -1).clamp(min=0.0)
+        ahead = arrive.unsqueeze(-2) - turns.unsqueeze(-1)
+        ahead = ahead.div_(width.clamp(min=_TINY).unsqueeze(-2)).clamp_(0.0, 1.0)  # share of the way, (..., 2d + 1, d)
+
+        value = (ahead @ self._drop).squeeze(-1) + self._lowest  # row.a at each breakpoint; the first has lam = 0
+        above, upper = torch.where(value >= self.bound, value, torch.inf).min(-1, keepdim=True)
+        below, lower = torch.where(value <= self.bound, value, -torch.inf).max(-1, keepdim=True)
+        share = (above - self.bound) / (above - below).clamp(min=_TINY)
+        start = ahead.take_along_dim(upper.unsqueeze(-1), -2).squeeze(-2)
+        end = ahead.take_along_dim(lower.unsqueeze(-1), -2).squeeze(-2)
+        held = torch.addcmul(self._last, torch.lerp(start, end, share), self._way_back)
+        active = value[..., :1] > self.bound
+        return torch.where(active & self._moving, held, free), active
+
+    def free(self, solution: Tensor, active: Tensor) -> Tensor:
+        """Where a coordinate of the solution may move (..., d): neither at the box nor at an active kink."""
+        inside = (solution > self.low) & (solution < self.high)
+        return torch.where(active & self._moving, inside, solution.abs() < 1.0)
 
 
-InnerSolver = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
-"""Maps a metric (..., d) to the minimiser (..., d) of sum(metric a^2 / 2 - target a) over a polyhedron, 1.0 on its
-free coordinates (..., d) and the row that holds it back, 0 where none does (..., d)."""
+InnerSolver = Callable[[Tensor], tuple[Tensor, Tensor, Tensor | None]]
+"""Maps a metric (..., d) to the minimiser (..., d) over a polyhedron, where it moves with the metric (..., d), and the
+row that holds it back, 0 where none does (..., d), or None where there is none at all."""
 
 
 def minimize_under_ellipse(
     inner: InnerSolver, target: Tensor, shift: float, scale: Tensor, bound: float
-) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+) -> tuple[Tensor, Tensor]:
     """argmin (..., d) of sum(shift a^2 / 2 - target a) over `inner`'s polyhedron and sum(scale a^2) <= bound.
 
-    shift 1 gives a projection, shift 0 a linear oracle; scale (..., d) >= 0. Returns the solution, the curvature
-    free / (shift + mu scale) (..., d), and the normals (..., d) of the active row and of the active ellipse.
+    scale (..., d) >= 0. Also returns the ellipse's multiplier mu (..., 1), by which the solution is `inner`'s for the
+    metric shift + mu scale, and which is 0 where the ellipse does not hold it back.
 
-    The dual function is concave in the ellipse's multiplier mu, so the ellipse's value falls along mu: Newton's method
-    on 1 / sqrt(value of the free coordinates), which is linear in mu for a sphere, within a bracket. Since
-    scale_i a_i <= |target_i| / mu, the multiplier is at most |target|_1 / bound.
+    The dual function is concave in mu, so the ellipse's value falls along mu: Newton's method on 1 / sqrt(value of the
+    free coordinates), which is linear in mu for a sphere, within a bracket. Since scale_i a_i <= |target_i| / mu, the
+    multiplier is at most |target|_1 / bound.
     """
     high = target.abs().sum(-1, keepdim=True) / bound
     low = mu = torch.zeros_like(high)
+    floor = 1e-9 * high
     for _ in range(_MAX_STEPS):
         metric = shift + mu * scale
         solution, free, row = inner(metric)
-        curvature = free / metric.clamp(min=_TINY)
         pull = scale * solution
         energy = pull * solution
-        value = energy.sum(-1, keepdim=True)
-        over = value > bound
-        # Written so that NaN counts as settled.
-        settled = ~((value - bound).abs() > 1e-13 * bound) | ~(over | (mu > 0.0))
+        excess = energy.sum(-1, keepdim=True) - bound
+        # A NaN counts as settled.
+        unsettled = torch.where(mu > 0.0, excess.abs(), excess) > 1e-13 * bound
         # Asking the device costs more than it saves on CUDA.
-        if not target.is_cuda and settled.all():
+        if not target.is_cuda and not unsettled.any():
             break
+        over = excess > 0.0
         low, high = torch.where(over, mu, low), torch.where(over, high, mu)
-        fall = 2.0 * (pull * deflated_jacobian(curvature, row)(pull)).sum(-1, keepdim=True)
+        curvature = free / metric.clamp(min=_TINY)
+        bend = curvature * pull
+        fall = (bend * pull).sum(-1, keepdim=True)
+        if row is not None:
+            lean = (bend * row).sum(-1, keepdim=True)
+            fall = fall - lean.square() / (curvature * row.square()).sum(-1, keepdim=True).clamp(min=_TINY)
         moving = (free * energy).sum(-1, keepdim=True)
-        newton = mu + 2.0 * moving / fall * ((moving / (bound - value + moving)).sqrt() - 1.0)
-        inside = (newton > low) & (newton < high)
-        middle = (torch.maximum(low, 1e-9 * high) * high).sqrt()
-        mu = torch.where(settled, mu, torch.where(inside, newton, middle))
-    return solution, curvature, (row, torch.where(mu > 0.0, pull, 0.0))
+        newton = mu + moving / fall * ((moving / (moving - excess)).sqrt() - 1.0)
+        middle = (torch.maximum(low, floor) * high).sqrt()
+        step = torch.where((newton > low) & (newton < high), newton, middle)
+        mu = torch.where(unsettled, step, mu)
+    return solution, mu

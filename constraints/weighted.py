@@ -1,7 +1,7 @@
 """Linear sets whose rows are sign or subset patterns of one weight vector.
 
 The sets have 2^d, 2^d - 1 and 1 rows, but within the orthant of a given point only one of them matters: projection and
-oracle are one scalar dual problem (`minimize_under_row`), and the gauge needs the one row that the ray meets.
+oracle are one scalar dual problem (`RowProblem`), and the gauge needs the one row that the ray meets.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from constraints.base import (
     largest_gauge,
     safe_sqrt,
 )
-from constraints.separable import minimize_under_row
+from constraints.separable import RowProblem
 
 
 class _WeightPatterns(Constraint):
@@ -42,13 +42,14 @@ class _WeightPatterns(Constraint):
         """The row (..., d) with the largest value in the orthant `side` (..., d), entries in {-1, 0, 1}."""
         raise NotImplementedError
 
-    def _orthant(self, weight: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Row and range (low, high) that hold the projection of `point`, or the oracle's answer for it.
+    def row_problem(self, obs: Tensor, target: Tensor) -> RowProblem:
+        """The one row, in one orthant, that the projection of `target` or the oracle's answer for it has to mind.
 
-        Neither crosses 0: the constraint never asks for the opposite sign.
+        The orthant is that of the target: the constraint never asks for the opposite sign.
         """
-        side = torch.where(point < 0.0, -1.0, 1.0)
-        return self._row(weight, side), (side - 1.0) / 2.0, (side + 1.0) / 2.0
+        weight, bound = self.scaled_weight(obs)
+        side = torch.where(target < 0.0, -1.0, 1.0)
+        return RowProblem(target, self._row(weight, side), bound, (side - 1.0) / 2.0, (side + 1.0) / 2.0)
 
     def scaled_weight(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Weight (..., d) and bound (..., 1) divided by the largest |weight|, which may be 0 or 1e6."""
@@ -71,16 +72,13 @@ class _WeightPatterns(Constraint):
         return safe_sqrt(self._excess(obs, action).clamp(min=0.0).square().sum(-1))
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        weight, bound = self.scaled_weight(obs)
-        row, low, high = self._orthant(weight, action)
-        solution, active = minimize_under_row(action, torch.ones_like(action), row, bound, low, high)
-        free = row_free(solution, row, active, low, high)
-        return self._pull_in(obs, solution), deflated_jacobian(free, row * active)
+        problem = self.row_problem(obs, action)
+        solution, active = problem.solve(torch.ones_like(action))
+        free = problem.free(solution, active).double()
+        return self._pull_in(obs, solution), deflated_jacobian(free, problem.row * active)
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        weight, bound = self.scaled_weight(obs)
-        row, low, high = self._orthant(weight, gradient)
-        solution, _ = minimize_under_row(gradient, torch.zeros_like(gradient), row, bound, low, high)
+        solution, _ = self.row_problem(obs, gradient).solve(torch.zeros_like(gradient))
         return self._pull_in(obs, solution)
 
     def gauge_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
@@ -153,22 +151,16 @@ class HalfSpace(_WeightPatterns):
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
         return weight.expand(torch.broadcast_shapes(weight.shape, side.shape))
 
-    def _orthant(self, weight: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        one = torch.ones_like(point)
-        return self._row(weight, point), -one, one
+    def row_problem(self, obs: Tensor, target: Tensor) -> RowProblem:
+        weight, bound = self.scaled_weight(obs)
+        one = torch.ones_like(target)
+        return RowProblem(target, self._row(weight, target), bound, -one, one)
 
     def _center(self, obs: Tensor) -> Tensor:
         weight, bound = self.scaled_weight(obs)
         total, norm = weight.abs().sum(-1, keepdim=True), weight.norm(dim=-1, keepdim=True)
         radius = ((bound + total) / (norm + total)).clamp(max=1.0)
         return -(1.0 - radius) * weight.sign()
-
-
-def row_free(solution: Tensor, row: Tensor, active: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """1.0 where a coordinate of a projection is free to move (..., d), 0.0 at the box or at an active kink."""
-    held = active & (row != 0.0)
-    inside = torch.where(held, (solution > low) & (solution < high), solution.abs() < 1.0)
-    return inside.double()
 
 
 @functools.lru_cache

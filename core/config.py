@@ -188,7 +188,7 @@ def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
         if text in ("null", "None", "~"):
             raise ConfigError(f"bad value {text!r} for {key}: a value is needed")
         try:
-            config[key] = _typed(key, text)
+            OmegaConf.update(config, key, _typed(key, text))
         except OmegaConfBaseException:
             kind = next(f.type for f in fields(Config) if f.name == key).replace(" | None", "")
             raise ConfigError(f"bad value {text!r} for {key}: expected {kind}") from None

@@ -104,9 +104,9 @@ class Table:
 
 
 def statistic(values: Sequence[float]) -> Statistic:
-    values = np.asarray(values, dtype=np.float64)
-    n = len(values)
-    return Statistic(float(values.mean()), float(values.std(ddof=1) / math.sqrt(n)) if n > 1 else math.nan, n)
+    array = np.asarray(values, dtype=np.float64)
+    n = len(array)
+    return Statistic(float(array.mean()), float(array.std(ddof=1) / math.sqrt(n)) if n > 1 else math.nan, n)
 
 
 def group_runs(runs: Iterable[Run]) -> Groups:
@@ -480,7 +480,8 @@ def _style(algo: str, points: int) -> dict[str, Any]:
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[Path, dict[str, str]]:
     """The folder of results and the options. Raises ConfigError for an unknown or repeated one."""
-    folders, options = [], {}
+    folders: list[str] = []
+    options: dict[str, str] = {}
     for word in arguments:
         key, equals, value = word.partition("=")
         if not equals or "/" in key:
@@ -507,11 +508,11 @@ def run(arguments: Sequence[str]) -> None:
     found = find_runs(root)
     if not found:
         raise ConfigError(f"no runs in {root} (looked for <task>/<algorithm>/seed=<n> in it)")
-    tasks = {folder.parent.parent.name for folder in found}
-    algos = {parse_variant(folder.parent.name)[0] for folder in found}
+    tasks_there = {folder.parent.parent.name for folder in found}
+    algos_there = {parse_variant(folder.parent.name)[0] for folder in found}
     # The choices are what there is, so that a new task or algorithm needs no entry here.
-    tasks = split_names(f"env in {root}", options.get("env", "all"), order_tasks(tasks))
-    algos = split_names(f"algo in {root}", options.get("algo", "all"), order_algos(algos))
+    tasks = split_names(f"env in {root}", options.get("env", "all"), order_tasks(tasks_there))
+    algos = split_names(f"algo in {root}", options.get("algo", "all"), order_algos(algos_there))
     runs, problems = read_results(root, tasks, algos)
     for problem in problems:
         print(f"skipped {problem}", file=sys.stderr)

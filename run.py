@@ -92,8 +92,6 @@ def train(config: Config, base: Config) -> None:
     from core.results import RunWriter, describe_environment, is_finished, read_run, run_folder, variant_name
     from core.trainer import Trainer, seed_config
 
-    if config.device != "cpu" and not torch.cuda.is_available():
-        raise ConfigError(f"bad value {config.device!r} for device: PyTorch finds no CUDA device here")
     torch.set_num_threads(config.threads)
     variant = variant_name(config.algo, differences(config, base))
     seeds = []

@@ -86,15 +86,15 @@ class SAC(Agent):
         super().__init__(config, constraint, obs_dim, seeds, **placement)
         init = Streams(seeds, "init").generators
         actor_class = StateDependentActor if config.gsde else GaussianActor
-        self.actor = actor_class(obs_dim, self.action_dim, config.hidden, init).to(config.device)
-        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init).to(config.device)
+        self.actor = actor_class(obs_dim, self.action_dim, config.hidden, init)
+        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init)
         self.critic_target = frozen_copy(self.critic)
-        self.temperature = Temperature(len(seeds)).to(config.device)
+        self.temperature = Temperature(len(seeds))
         self.actor_optimizer = adam(self.actor.parameters(), config.learning_rate)
         self.critic_optimizer = adam(self.critic.parameters(), config.learning_rate)
         self.temperature_optimizer = adam(self.temperature.parameters(), config.learning_rate)
         self.target_entropy = -float(self.action_dim)
-        self.rollout_noise = torch.zeros(len(seeds), *self.actor.noise_shape, device=config.device)
+        self.rollout_noise = torch.zeros(len(seeds), *self.actor.noise_shape)
 
     def networks(self) -> dict[str, nn.Module]:
         return {
@@ -116,7 +116,7 @@ class SAC(Agent):
         if self.config.gsde:
             noise = self.rollout_noise
         else:
-            noise = self.exploration.normal(*self.actor.noise_shape, only=only).to(obs.device).unsqueeze(1)
+            noise = self.exploration.normal(*self.actor.noise_shape, only=only).unsqueeze(1)
         raw, _, _ = self.actor.sample(obs.unsqueeze(1), noise)
         return self.suggest(raw.squeeze(1))
 
@@ -171,9 +171,9 @@ class SAC(Agent):
     def draw_noise(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Noise for the samples at s and at s': with gSDE one theta serves both, for the whole batch."""
         if self.config.gsde:
-            theta = self.update_noise.normal(*self.actor.noise_shape).to(batch.obs.device)
+            theta = self.update_noise.normal(*self.actor.noise_shape)
             return theta, theta
-        noise = self.update_noise.normal(2, *batch.action.shape[1:]).to(batch.obs.device)
+        noise = self.update_noise.normal(2, *batch.action.shape[1:])
         return noise[:, 0], noise[:, 1]
 
 

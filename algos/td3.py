@@ -26,8 +26,8 @@ class TD3(Agent):
     def __init__(self, config: Config, constraint: Constraint, obs_dim: int, seeds: Sequence[int], **placement):
         super().__init__(config, constraint, obs_dim, seeds, **placement)
         init = Streams(seeds, "init").generators
-        self.actor = MLP([obs_dim, *config.hidden, self.action_dim], init).to(config.device)
-        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init).to(config.device)
+        self.actor = MLP([obs_dim, *config.hidden, self.action_dim], init)
+        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init)
         self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
         self.actor_optimizer = adam(self.actor.parameters(), config.learning_rate)
         self.critic_optimizer = adam(self.critic.parameters(), config.learning_rate)
@@ -47,7 +47,7 @@ class TD3(Agent):
 
     @torch.no_grad()
     def explore(self, obs: Tensor, only: Sequence[int]) -> Tensor:
-        noise = self.config.action_noise * self.exploration.normal(self.action_dim, only=only).to(obs.device)
+        noise = self.config.action_noise * self.exploration.normal(self.action_dim, only=only)
         suggested = self.suggest(self.actor, obs.unsqueeze(1)).squeeze(1) + noise
         return suggested.clamp(-1.0, 1.0) if self.bounded else suggested
 
@@ -84,7 +84,7 @@ class TD3(Agent):
         action = self.suggest(self.actor_target, batch.next_obs)
         if self.placement != "environment":
             action = self.feasible(batch.next_obs, action, batch.next_center)
-        noise = self.update_noise.normal(*action.shape[1:]).to(action.device) * self.config.target_noise
+        noise = self.update_noise.normal(*action.shape[1:]) * self.config.target_noise
         action = action + noise.clamp(-self.config.target_noise_clip, self.config.target_noise_clip)
         if self.bounded:
             return action.clamp(-1.0, 1.0)

@@ -50,10 +50,9 @@ class Config:
     results: str = field(default="results", metadata={"help": "folder that results go to"})
     overwrite: bool = field(default=False, metadata={"help": "run a finished run again; the old one is kept"})
     threads: int = field(default=1, metadata={"help": "CPU threads of PyTorch"})
-    device: str = field(default="cpu", metadata={"help": "cpu or cuda"})
 
 
-RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "threads", "device")
+RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "threads")
 """Settings that do not make a run another experiment: they never show in a run's name."""
 
 TD3_CONSTANTS = {"policy_delay": 2, "target_noise": 0.2, "target_noise_clip": 0.5}
@@ -192,7 +191,7 @@ def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
         except OmegaConfBaseException:
             kind = next(f.type for f in fields(Config) if f.name == key).replace(" | None", "")
             raise ConfigError(f"bad value {text!r} for {key}: expected {kind}") from None
-    resolved: Config = OmegaConf.to_object(config)
+    resolved = typing.cast(Config, OmegaConf.to_object(config))
     _check_ranges(resolved)
     return resolved
 
@@ -218,7 +217,6 @@ def _check_ranges(config: Config) -> None:
     demand("gradient_steps", config.gradient_steps == -1 or config.gradient_steps >= 1, "must be -1 or at least 1")
     freq = config.train_freq
     demand("train_freq", freq == "episode" or (freq.isdecimal() and int(freq) >= 1), "must be steps or 'episode'")
-    demand("device", config.device == "cpu" or config.device.startswith("cuda"), "must be cpu or cuda")
 
 
 def differences(config: Config, base: Config) -> dict[str, object]:

@@ -32,7 +32,7 @@ class Evaluator:
         returns = np.zeros((len(which), count))
         running = [(i, j) for i in range(len(which)) for j in range(count)]
         while running:
-            actions = policy(torch.from_numpy(obs)).cpu().numpy()
+            actions = policy(torch.from_numpy(obs)).numpy()
             still_running = []
             for i, j in running:
                 obs[i, j], reward, terminated, truncated, _ = envs[i][j].step(actions[i, j])

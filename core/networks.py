@@ -5,13 +5,19 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
+Network = TypeVar("Network", bound=nn.Module)
+
 
 class Linear(nn.Module):
-    """`rows` affine maps side by side: (rows, batch, inputs) -> (rows, batch, outputs)."""
+    """Affine maps side by side, one a row: (rows, batch, inputs) -> (rows, batch, outputs).
+
+    An input of fewer rows goes through the first of them.
+    """
 
     def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]):
         super().__init__()
@@ -24,7 +30,10 @@ class Linear(nn.Module):
         self.weight, self.bias = nn.Parameter(weight), nn.Parameter(bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
+        rows = x.shape[0]
+        if rows == self.weight.shape[0]:  # slicing would cost a copy of the gradient
+            return torch.baddbmm(self.bias, x, self.weight)
+        return torch.baddbmm(self.bias[:rows], x, self.weight[:rows])
 
 
 class MLP(nn.Module):
@@ -56,20 +65,16 @@ class TwinCritic(nn.Module):
 
     def first(self, obs: Tensor, action: Tensor) -> Tensor:
         """Q-values (seeds, batch) of the first critic alone."""
-        x = torch.cat([obs, action], dim=-1)
-        for layer in self.net.layers[:-1]:
-            x = torch.baddbmm(layer.bias[: x.shape[0]], x, layer.weight[: x.shape[0]]).relu_()
-        last = self.net.layers[-1]
-        return torch.baddbmm(last.bias[: x.shape[0]], x, last.weight[: x.shape[0]]).squeeze(-1)
+        return self.net(torch.cat([obs, action], dim=-1)).squeeze(-1)
 
 
-def rows_of(module: nn.Module, which: Sequence[int]) -> nn.Module:
+def rows_of(module: Network, which: Sequence[int]) -> Network:
     """A frozen copy of `module` that has only the rows `which` of each parameter."""
     memo = {id(p): nn.Parameter(p.detach()[list(which)], requires_grad=False) for p in module.parameters()}
     return copy.deepcopy(module, memo)
 
 
-def frozen_copy(module: nn.Module) -> nn.Module:
+def frozen_copy(module: Network) -> Network:
     """A copy that no optimiser trains, for target networks."""
     return copy.deepcopy(module).requires_grad_(False)
 

@@ -26,10 +26,10 @@ class Batch(NamedTuple):
 class Replay:
     """A ring of `capacity` transitions for each seed."""
 
-    def __init__(self, seeds: Sequence[int], capacity: int, obs_dim: int, action_dim: int, centers: bool, device: str):
+    def __init__(self, seeds: Sequence[int], capacity: int, obs_dim: int, action_dim: int, centers: bool):
         self.capacity = capacity
         self.widths = [obs_dim, action_dim, 1, 1, obs_dim] + [action_dim] * (2 if centers else 0)
-        self.rows = torch.empty(len(seeds) * capacity, sum(self.widths), device=device)
+        self.rows = torch.empty(len(seeds) * capacity, sum(self.widths))
         self.offsets = torch.arange(len(seeds)).unsqueeze(1) * capacity
         self.added = [0] * len(seeds)
         self.streams = Streams(seeds, "replay")
@@ -45,6 +45,6 @@ class Replay:
         """`batch_size` transitions of every seed, uniform with replacement."""
         sizes = [min(n, self.capacity) for n in self.added]
         indices = self.streams.indices(sizes, batch_size) + self.offsets
-        rows = self.rows.index_select(0, indices.flatten().to(self.rows.device)).view(*indices.shape, -1)
+        rows = self.rows.index_select(0, indices.flatten()).view(*indices.shape, -1)
         obs, action, reward, terminated, next_obs, *centers = rows.split(self.widths, dim=-1)
         return Batch(obs, action, reward[..., 0], terminated[..., 0], next_obs, *(centers or (None, None)))

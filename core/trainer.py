@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -47,7 +48,6 @@ class Trainer:
             agent.obs_dim,
             agent.action_dim,
             agent.stores_centers,
-            config.device,
         )
         count = len(self.seeds)
         self.steps = [0] * count
@@ -107,18 +107,18 @@ class Trainer:
     def _step(self, which: Sequence[int]) -> None:
         """One environment step of the seeds `which`."""
         suggested, executed = self._act(which)
-        actions = executed.cpu().numpy()
-        next_obs, reset_obs = self.obs.cpu().numpy().copy(), {}
+        actions = executed.numpy()
+        arrived, reset_obs = self.obs.numpy().copy(), {}
         reward, terminated, ended = (np.zeros((len(self.seeds), 1), dtype=np.float32) for _ in range(3))
         with self._timed("environment"):
             for i in which:
-                next_obs[i], reward[i], terminated[i], truncated, _ = self.envs[i].step(actions[i])
+                arrived[i], reward[i], terminated[i], truncated, _ = self.envs[i].step(actions[i])
                 if terminated[i] or truncated:
                     ended[i] = True
                     reset_obs[i] = self.envs[i].reset()[0]
 
         stored = suggested if self.agent.placement == "environment" else executed
-        next_obs = self._tensor(next_obs)
+        next_obs = self._tensor(arrived)
         columns = [self.obs, stored, self._tensor(reward), self._tensor(terminated), next_obs]
         if self.agent.stores_centers:
             with self._timed("map"):
@@ -138,21 +138,24 @@ class Trainer:
         """Suggested and executed actions (seeds, d); only the rows `which` mean anything."""
         warm = [i for i in which if self.steps[i] < self.config.learning_starts]
         trained = [i for i in which if self.steps[i] >= self.config.learning_starts]
-        suggested = executed = torch.zeros(len(self.seeds), self.agent.action_dim, device=self.obs.device)
-        for rows, suggest, map_to_set in (
-            (warm, lambda: self.agent.warm_up(warm).to(self.obs.device), self.agent.pull_back),
-            (trained, lambda: self.agent.explore(self.obs, trained), self.agent.feasible),
-        ):
-            if not rows:
-                continue
-            action = suggest()
-            with self._timed("map"):
-                mapped = map_to_set(self.obs, action, self.center)
-            if len(rows) == len(which):
-                return action, mapped
-            suggested, executed = suggested.clone(), executed.clone()
-            suggested[rows], executed[rows] = action[rows], mapped[rows]
+        suggested = torch.zeros(len(self.seeds), self.agent.action_dim)
+        if warm:
+            suggested[warm] = self.agent.warm_up(warm)[warm]
+        if trained:
+            suggested[trained] = self.agent.explore(self.obs, trained)[trained]
+        with self._timed("map"):
+            if trained:
+                executed = self.agent.feasible(self.obs, suggested, self.center)
+            if warm:
+                pulled_back = self.agent.pull_back(self.obs, suggested, self.center)
+                executed = torch.where(self._rows(warm), pulled_back, executed) if trained else pulled_back
         return suggested, executed
+
+    def _rows(self, which: Sequence[int]) -> torch.Tensor:
+        """Mask (seeds, 1) of the seeds `which`."""
+        mask = torch.zeros(len(self.seeds), 1, dtype=torch.bool)
+        mask[which] = True
+        return mask
 
     def _count_step(self, which: Sequence[int], ended: np.ndarray) -> None:
         """Advance the counters of `which`: rollouts that end, evaluations and ends of training that are due."""
@@ -198,7 +201,7 @@ class Trainer:
         with self._timed("evaluation"):
             returns = self.evaluator.run(self.agent.policy(which), which, self.config.final_episodes)
         for i, seed_returns in zip(which, returns, strict=True):
-            envs = [env.unwrapped for env in (self.envs[i], *self.evaluator.of_seed(i))]
+            envs: list[Any] = [env.unwrapped for env in (self.envs[i], *self.evaluator.of_seed(i))]
             self.results[i] = {
                 "return_mean": float(seed_returns.mean()),
                 "returns": seed_returns,
@@ -213,7 +216,7 @@ class Trainer:
             self.writers[i].finish(self.results[i])
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(array, dtype=torch.float32, device=self.config.device)
+        return torch.as_tensor(array, dtype=torch.float32)
 
     @contextmanager
     def _timed(self, phase: str):

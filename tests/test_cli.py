@@ -65,7 +65,6 @@ def test_usage_names_every_algorithm_task_and_key(capsys, arguments):
         ("algo=SRad env=W+M action_noise=0.1", "does not apply to SRad"),
         ("algo=DPre env=W+M penalty=2", "does not apply to DPre"),
         ("algo=DPre env=W+M fw_learning_rate=0.1", "does not apply to DPre"),
-        ("algo=SRad env=W+M device=tpu", "must be cpu or cuda"),
         ("algo=SRad env=W+M overwrite=maybe", "bad value 'maybe' for overwrite"),
     ],
 )

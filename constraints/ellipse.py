@@ -193,7 +193,7 @@ def ellipse_gauge_gradient(
     1 / L is the positive root of the quadratic in t at center + t direction.
     """
     curvature = (direction * bent_direction).sum(-1, keepdim=True)
-    if center is None:
+    if center is None or bent_center is None:
         met = curvature > 0.0
         root = (torch.where(met, curvature, 1.0) * bound).sqrt()
         return torch.where(met, bent_direction / root, 0.0)

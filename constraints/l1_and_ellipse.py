@@ -35,26 +35,23 @@ class WeightedL1AndEllipse(Constraint):
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         return self.l1._penalty(obs, action) + self.ellipse._penalty(obs, action)
 
-    def _solve(self, obs: Tensor, target: Tensor, shift: float) -> tuple[RowProblem, Tensor, Tensor]:
-        problem = self.l1.row_problem(obs, target)
-
+    def _solve(self, problem: RowProblem, obs: Tensor, shift: float) -> tuple[Tensor, Tensor]:
         def under_row(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            solution, active = problem.solve(metric)
-            return solution, (solution > problem.low) & (solution < problem.high), problem.row * active
+            solution, row = problem.solve(metric)
+            return solution, problem.inside(solution), row
 
-        solution, mu = minimize_under_ellipse(under_row, target, shift, self.ellipse.scale(obs), self.ellipse.bound)
-        return problem, solution, mu
+        return minimize_under_ellipse(under_row, problem.target, shift, self.ellipse.scale(obs), self.ellipse.bound)
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        problem, solution, mu = self._solve(obs, action, 1.0)
+        problem = self.l1.row_problem(obs, action)
+        _, mu = self._solve(problem, obs, 1.0)
         metric = 1.0 + mu * self.ellipse.scale(obs)
-        solution, active = problem.solve(metric)
-        curvature = problem.free(solution, active) / metric
-        normals = problem.row * active, self.ellipse.normal(obs, solution, mu)
-        return self._pull_in(obs, solution), deflated_jacobian(curvature, *normals)
+        solution, row = problem.solve(metric)
+        curvature = problem.free(solution, row) / metric
+        return self._pull_in(obs, solution), deflated_jacobian(curvature, row, self.ellipse.normal(obs, solution, mu))
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        return self._pull_in(obs, self._solve(obs, gradient, 0.0)[1])
+        return self._pull_in(obs, self._solve(self.l1.row_problem(obs, gradient), obs, 0.0)[0])
 
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         return largest_gauge(

@@ -42,7 +42,7 @@ class RowProblem:
         self._lowest = (row * self._last).sum(-1, keepdim=True)
 
     def solve(self, metric: Tensor) -> tuple[Tensor, Tensor]:
-        """The solution (..., d) and whether the row holds it back (..., 1)."""
+        """The solution (..., d), and the row where it holds the solution back, 0 elsewhere (..., d)."""
         free = torch.clamp(self.target / metric.clamp(min=_TINY), self.low, self.high)
         arrive = torch.addcmul(self._target_turn, metric, self._last_turn, value=-1.0)
         width = metric * self._way_turn
@@ -59,12 +59,19 @@ class RowProblem:
         end = ahead.take_along_dim(lower.unsqueeze(-1), -2).squeeze(-2)
         held = torch.addcmul(self._last, torch.lerp(start, end, share), self._way_back)
         active = value[..., :1] > self.bound
-        return torch.where(active & self._moving, held, free), active
+        held_by = self.row * active
+        return torch.where(held_by != 0.0, held, free), held_by
 
-    def free(self, solution: Tensor, active: Tensor) -> Tensor:
-        """Where a coordinate of the solution may move (..., d): neither at the box nor at an active kink."""
-        inside = (solution > self.low) & (solution < self.high)
-        return torch.where(active & self._moving, inside, solution.abs() < 1.0)
+    def inside(self, solution: Tensor) -> Tensor:
+        """Where a coordinate of the solution is strictly between low and high (..., d)."""
+        return (solution > self.low) & (solution < self.high)
+
+    def free(self, solution: Tensor, held_by: Tensor) -> Tensor:
+        """Where a coordinate of the solution may move (..., d): neither at the box nor at an active kink.
+
+        held_by (..., d): the row where it holds the solution back, 0 elsewhere.
+        """
+        return torch.where(held_by != 0.0, self.inside(solution), solution.abs() < 1.0)
 
 
 InnerSolver = Callable[[Tensor], tuple[Tensor, Tensor, Tensor | None]]
@@ -77,8 +84,8 @@ def minimize_under_ellipse(
 ) -> tuple[Tensor, Tensor]:
     """argmin (..., d) of sum(shift a^2 / 2 - target a) over `inner`'s polyhedron and sum(scale a^2) <= bound.
 
-    scale (..., d) >= 0. Also returns the ellipse's multiplier mu (..., 1), by which the solution is `inner`'s for the
-    metric shift + mu scale, and which is 0 where the ellipse does not hold it back.
+    scale (..., d) >= 0. The solution is `inner`'s for the metric shift + mu scale; also returns the ellipse's
+    multiplier mu (..., 1), 0 where the ellipse does not hold the solution back.
 
     The dual function is concave in mu, so the ellipse's value falls along mu: Newton's method on 1 / sqrt(value of the
     free coordinates), which is linear in mu for a sphere, within a bracket. Since scale_i a_i <= |target_i| / mu, the
@@ -86,7 +93,9 @@ def minimize_under_ellipse(
     """
     high = target.abs().sum(-1, keepdim=True) / bound
     low = mu = torch.zeros_like(high)
-    floor = 1e-9 * high
+    # Where Newton's step leaves the bracket, its geometric middle; the first such is at a guess for the ellipse alone.
+    guess_square = (target.square() / scale.clamp(min=bound)).sum(-1, keepdim=True) / bound
+    floor = guess_square / high.clamp(min=_TINY)
     for _ in range(_MAX_STEPS):
         metric = shift + mu * scale
         solution, free, row = inner(metric)
@@ -108,7 +117,7 @@ def minimize_under_ellipse(
             fall = fall - lean.square() / (curvature * row.square()).sum(-1, keepdim=True).clamp(min=_TINY)
         moving = (free * energy).sum(-1, keepdim=True)
         newton = mu + moving / fall * ((moving / (moving - excess)).sqrt() - 1.0)
-        middle = (torch.maximum(low, floor) * high).sqrt()
+        middle = (torch.maximum(low, torch.minimum(floor, 1e-3 * high)) * high).sqrt()
         step = torch.where((newton > low) & (newton < high), newton, middle)
         mu = torch.where(unsettled, step, mu)
     return solution, mu

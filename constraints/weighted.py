@@ -73,9 +73,8 @@ class _WeightPatterns(Constraint):
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         problem = self.row_problem(obs, action)
-        solution, active = problem.solve(torch.ones_like(action))
-        free = problem.free(solution, active).double()
-        return self._pull_in(obs, solution), deflated_jacobian(free, problem.row * active)
+        solution, row = problem.solve(torch.ones_like(action))
+        return self._pull_in(obs, solution), deflated_jacobian(problem.free(solution, row).double(), row)
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         solution, _ = self.row_problem(obs, gradient).solve(torch.zeros_like(gradient))

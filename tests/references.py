@@ -47,8 +47,8 @@ class ReferenceSet:
     def normal_cone_residual(self, point: np.ndarray, outward: np.ndarray) -> float:
         """Distance of `outward` to the normal cone at the feasible `point`.
 
-        A point is the projection of x where x - point is in its normal cone, and maximises <g, .> where g is. A residual
-        r leaves the projection within r of the true one, as that of x - r is exact and projections do not expand.
+        A point is the projection of x where x - point is in its normal cone, and maximises <g, .> where g is. A
+        residual r leaves it within |r| of the true projection: it is that of x - r, and projections do not expand.
         """
         rows = np.vstack((self._unit_rows(), np.eye(self.dim), -np.eye(self.dim)))
         excess = np.concatenate((self._row_excess(point), point - 1.0, -point - 1.0))

@@ -22,6 +22,10 @@ Coefficients = Callable[[Tensor], Tensor]
 JacobianProduct = Callable[[Tensor], Tensor]
 """Multiplies the symmetric Jacobian of a projection with a vector (..., d)."""
 
+ExplicitSet = tuple[Tensor, Tensor, list[tuple[Tensor, Tensor, Tensor | float]]]
+"""Rows A (..., m, d), bounds b (..., m) and ellipses (Q (..., d, d), c (..., d), bound (...)): A a <= b and
+(a - c)' Q (a - c) <= bound, the box left out."""
+
 
 class Constraint:
     """A feasible set A(obs) inside the box [-1, 1]^dim.
@@ -67,6 +71,10 @@ class Constraint:
     def _center(self, obs: Tensor) -> Tensor:
         """Interior point (..., d) or one (d,) for every obs."""
         return obs.new_zeros(self.dim)
+
+    def explicit(self, obs: Tensor) -> ExplicitSet:
+        """The set written out in rows and ellipses, as a part of an `Intersection` must be."""
+        raise NotImplementedError(f"{type(self).__name__} does not write out its rows and ellipses")
 
     # ---------------------------------------------------------------- the interface
 

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from constraints.base import Constraint, JacobianProduct, box_gauge_gradient, deflated_jacobian, largest_gauge
+from constraints.base import (
+    Constraint,
+    ExplicitSet,
+    JacobianProduct,
+    box_gauge_gradient,
+    deflated_jacobian,
+    largest_gauge,
+)
 
 
 class Box(Constraint):
     """The box [-1, 1]^dim."""
+
+    def explicit(self, obs: Tensor) -> ExplicitSet:
+        return obs.new_zeros(0, self.dim), obs.new_zeros(0), []
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         return action.abs().amax(-1) - 1.0

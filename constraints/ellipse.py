@@ -8,6 +8,7 @@ from torch import Tensor
 from constraints.base import (
     Coefficients,
     Constraint,
+    ExplicitSet,
     JacobianProduct,
     box_gauge_gradient,
     deflated_jacobian,
@@ -25,6 +26,10 @@ class DiagonalEllipse(Constraint):
         _check_bound(bound)
         self.scale = scale
         self.bound = bound
+
+    def explicit(self, obs: Tensor) -> ExplicitSet:
+        ellipse = torch.diag_embed(self.scale(obs)), obs.new_zeros(self.dim), self.bound
+        return obs.new_zeros(0, self.dim), obs.new_zeros(0), [ellipse]
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         scale = self.scale(obs)
@@ -75,6 +80,9 @@ class PlanarEllipse(Constraint):
         _check_bound(bound)
         self.matrix = matrix
         self.bound = bound
+
+    def explicit(self, obs: Tensor) -> ExplicitSet:
+        return obs.new_zeros(0, 2), obs.new_zeros(0), [(self.matrix(obs), obs.new_zeros(2), self.bound)]
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         matrix = self.matrix(obs)

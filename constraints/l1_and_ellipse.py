@@ -8,6 +8,7 @@ from torch import Tensor
 from constraints.base import (
     Coefficients,
     Constraint,
+    ExplicitSet,
     JacobianProduct,
     box_gauge_gradient,
     deflated_jacobian,
@@ -28,6 +29,10 @@ class WeightedL1AndEllipse(Constraint):
         super().__init__(dim)
         self.l1 = WeightedL1(weight, weight_bound, dim)
         self.ellipse = DiagonalEllipse(scale, scale_bound, dim)
+
+    def explicit(self, obs: Tensor) -> ExplicitSet:
+        rows, bounds, _ = self.l1.explicit(obs)
+        return rows, bounds, self.ellipse.explicit(obs)[2]
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         return torch.maximum(self.l1._violation(obs, action), self.ellipse._violation(obs, action))

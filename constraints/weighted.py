@@ -15,6 +15,7 @@ from torch import Tensor
 from constraints.base import (
     Coefficients,
     Constraint,
+    ExplicitSet,
     JacobianProduct,
     box_gauge_gradient,
     deflated_jacobian,
@@ -41,6 +42,10 @@ class _WeightPatterns(Constraint):
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
         """The row (..., d) with the largest value in the orthant `side` (..., d), entries in {-1, 0, 1}."""
         raise NotImplementedError
+
+    def explicit(self, obs: Tensor) -> ExplicitSet:
+        rows = self.weight(obs).unsqueeze(-2) * self._patterns(obs.device)
+        return rows, torch.full_like(rows[..., 0], self.bound), []
 
     def row_problem(self, obs: Tensor, target: Tensor) -> RowProblem:
         """The one row, in one orthant, that the projection of `target` or the oracle's answer for it has to mind.

@@ -54,10 +54,11 @@ class RowProblem:
         value = (ahead @ self._drop).squeeze(-1) + self._lowest  # row.a at each breakpoint; the first has lam = 0
         above, upper = torch.where(value >= self.bound, value, torch.inf).min(-1, keepdim=True)
         below, lower = torch.where(value <= self.bound, value, -torch.inf).max(-1, keepdim=True)
-        share = (above - self.bound) / (above - below).clamp(min=_TINY)
+        # Measured from below, a coordinate that the row presses against 0 keeps its relative precision.
+        share = (self.bound - below) / (above - below).clamp(min=_TINY)
         start = ahead.take_along_dim(upper.unsqueeze(-1), -2).squeeze(-2)
         end = ahead.take_along_dim(lower.unsqueeze(-1), -2).squeeze(-2)
-        held = torch.addcmul(self._last, torch.lerp(start, end, share), self._way_back)
+        held = torch.addcmul(self._last, torch.lerp(end, start, share), self._way_back)
         active = value[..., :1] > self.bound
         held_by = self.row * active
         return torch.where(held_by != 0.0, held, free), held_by

@@ -1,0 +1,56 @@
+"""Several constraints at once."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from constraints.base import Constraint, ExplicitSet
+from constraints.errors import name_samples, require
+from constraints.general import GeneralConstraint, check_obs
+
+
+class Intersection(GeneralConstraint):
+    """What all of `constraints` allow; any constraint of this package, a user's own, or another intersection.
+
+    `penalty` is the sum of the constraints' penalties, `violation` the largest violation. `center` is the Chebyshev
+    centre if all are linear; with an ellipse it is the origin where that is interior, and the point deepest in the set
+    elsewhere. Methods raise a ConstraintError as those of LinearConstraint and QuadraticConstraint do.
+    """
+
+    def __init__(self, *constraints: Constraint):
+        if not constraints:
+            raise ValueError("an intersection needs at least one constraint")
+        dims = {constraint.dim for constraint in constraints}
+        if len(dims) > 1:
+            raise ValueError(f"constraints of different dimensions: {sorted(dims)}")
+        super().__init__(dims.pop())
+        self.constraints = constraints
+
+    def explicit(self, obs: Tensor) -> ExplicitSet:
+        check_obs(obs)
+        parts = [constraint.explicit(obs) for constraint in self.constraints]
+        lead = torch.broadcast_shapes(*(rows.shape[:-2] for rows, _, _ in parts), *(b.shape[:-1] for _, b, _ in parts))
+        rows = torch.cat([rows.expand(*lead, *rows.shape[-2:]) for rows, _, _ in parts], -2)
+        bounds = torch.cat([bounds.expand(*lead, bounds.shape[-1]) for _, bounds, _ in parts], -1)
+        return rows, bounds, [ellipse for _, _, ellipses in parts for ellipse in ellipses]
+
+    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
+        check_obs(obs)
+        excess = [constraint._violation(obs, action) for constraint in self.constraints]
+        return torch.stack(torch.broadcast_tensors(*excess)).amax(0)
+
+    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
+        check_obs(obs)
+        return sum((constraint._penalty(obs, action) for constraint in self.constraints), 0.0 * action.sum(-1))
+
+    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        check_obs(obs)
+        gradients = []
+        for constraint in self.constraints:
+            # The closed forms take the centre's word for it.
+            if not isinstance(constraint, GeneralConstraint) and center is not None:
+                inside = constraint._violation(obs, center) < 0.0
+                require(inside.flatten(), "the centre is not interior", name_samples(tuple(inside.shape)))
+            gradients.append(constraint._gauge_and_gradient(obs, direction, center)[1])
+        return gradients

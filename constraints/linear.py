@@ -1,0 +1,76 @@
+"""Half-spaces of one's own: A(obs) a <= b(obs) in the box, any number of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from constraints.base import ExplicitSet, safe_sqrt
+from constraints.errors import name_samples, require
+from constraints.general import GeneralConstraint, check_obs, checked, unit_rows
+
+
+class LinearConstraint(GeneralConstraint):
+    """A(obs) a <= b(obs) in the box [-1, 1]^dim.
+
+    Give A and b as functions, or override them in a subclass. `center` is the Chebyshev centre. Methods raise a
+    ConstraintError that names the sample, and the row where there is one, for NaN or infinite observations or
+    coefficients, wrong shapes and an empty set; `center` and what needs one also for a set without interior.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        A: Callable[[Tensor], Tensor] | None = None,
+        b: Callable[[Tensor], Tensor] | None = None,
+    ):
+        super().__init__(dim)
+        self._A, self._b = A, b
+
+    def A(self, obs: Tensor) -> Tensor:
+        """Rows (..., m, d) at obs (..., n), which is float64; they are scaled to unit norm where that matters."""
+        if self._A is None:
+            raise NotImplementedError(f"{type(self).__name__} needs A(obs)")
+        return self._A(obs)
+
+    def b(self, obs: Tensor) -> Tensor:
+        """Bounds (..., m) of the rows at obs (..., n)."""
+        if self._b is None:
+            raise NotImplementedError(f"{type(self).__name__} needs b(obs)")
+        return self._b(obs)
+
+    def explicit(self, obs: Tensor) -> ExplicitSet:
+        check_obs(obs)
+        rows = checked(self.A(obs), "A(obs)", (-1, self.dim), obs)
+        bounds = checked(self.b(obs), "b(obs)", (rows.shape[-2],), obs)
+        return rows, bounds, []
+
+    def _excess(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Ax - b (..., m) with unit rows."""
+        rows, bounds = unit_rows(*self.explicit(obs)[:2])
+        return (rows @ action.unsqueeze(-1)).squeeze(-1) - bounds
+
+    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
+        excess = self._excess(obs, action)
+        return torch.cat((excess, action.detach().abs().amax(-1, keepdim=True) - 1.0), -1).amax(-1)
+
+    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
+        return safe_sqrt(self._excess(obs, action).clamp(min=0.0).square().sum(-1))
+
+    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        rows, bounds = unit_rows(*self.explicit(obs)[:2])
+        lead, m = direction.shape[:-1], rows.shape[-2]
+        rows, slack = rows.expand(*lead, m, self.dim), bounds.expand(*lead, m)
+        if m == 0:
+            return []
+        if center is not None:
+            slack = slack - (rows @ center.unsqueeze(-1)).squeeze(-1)
+        # 0 <= 0 holds everywhere.
+        vacuous = (rows == 0.0).all(-1) & (slack >= 0.0)
+        inside = vacuous | (slack > 0.0)
+        require(inside.reshape(-1, m), "the centre is not inside this row", name_samples(tuple(lead)))
+        normals = rows / torch.where(vacuous, 1.0, slack).unsqueeze(-1)
+        first = (normals @ direction.detach().unsqueeze(-1)).argmax(-2, keepdim=True)
+        return [normals.take_along_dim(first, -2).squeeze(-2)]

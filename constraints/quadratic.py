@@ -1,0 +1,83 @@
+"""An ellipse of one's own: (a - c(obs))' Q(obs) (a - c(obs)) <= bound(obs) in the box."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from constraints.base import ExplicitSet
+from constraints.ellipse import ellipse_excess, ellipse_gauge_gradient
+from constraints.errors import name_samples, require
+from constraints.general import GeneralConstraint, check_obs, checked
+
+Coefficient = Callable[[Tensor], Tensor]
+
+
+class QuadraticConstraint(GeneralConstraint):
+    """(a - c(obs))' Q(obs) (a - c(obs)) <= bound(obs) in the box [-1, 1]^dim, Q positive semi-definite, bound > 0.
+
+    Give Q, bound (a function or a number) and c (default: the origin), or override them in a subclass. `center` is c,
+    or where c is not inside the box the point deepest in the set. Methods raise a ConstraintError that names the sample
+    for NaN or infinite observations or coefficients, wrong shapes, a Q that is not positive semi-definite, a bound that
+    is not positive, and a set that is empty or without interior.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        Q: Coefficient | None = None,
+        bound: Coefficient | float | None = None,
+        c: Coefficient | None = None,
+    ):
+        super().__init__(dim)
+        self._Q, self._bound, self._c = Q, bound, c
+
+    def Q(self, obs: Tensor) -> Tensor:
+        """Matrix (..., d, d), symmetric positive semi-definite, at obs (..., n), which is float64."""
+        if self._Q is None:
+            raise NotImplementedError(f"{type(self).__name__} needs Q(obs)")
+        return self._Q(obs)
+
+    def bound(self, obs: Tensor) -> Tensor | float:
+        """Bound (...) or a number, positive."""
+        if self._bound is None:
+            raise NotImplementedError(f"{type(self).__name__} needs bound(obs)")
+        return self._bound(obs) if callable(self._bound) else self._bound
+
+    def c(self, obs: Tensor) -> Tensor:
+        """Centre (..., d) of the ellipse."""
+        return obs.new_zeros(self.dim) if self._c is None else self._c(obs)
+
+    def explicit(self, obs: Tensor) -> ExplicitSet:
+        check_obs(obs)
+        matrix = checked(self.Q(obs), "Q(obs)", (self.dim, self.dim), obs)
+        center = checked(self.c(obs), "c(obs)", (self.dim,), obs)
+        bound = checked(self.bound(obs), "bound(obs)", (), obs)
+        name = name_samples(tuple(matrix.shape[:-2]))
+        largest = matrix.abs().flatten(-2).amax(-1)
+        skew = (matrix - matrix.mT).abs().flatten(-2).amax(-1)
+        require((skew <= 1e-9 * largest).flatten(), "Q(obs) is not symmetric", name)
+        least = torch.linalg.eigvalsh(matrix)[..., 0]
+        require((least >= -1e-9 * largest).flatten(), "Q(obs) is not positive semi-definite", name)
+        require((bound > 0.0).flatten(), "bound(obs) is not positive", name_samples(tuple(bound.shape)))
+        return obs.new_zeros(0, self.dim), obs.new_zeros(0), [(matrix, center, bound)]
+
+    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
+        _, _, [(matrix, center, bound)] = self.explicit(obs)
+        offset = action - center
+        value = (offset * (matrix @ offset.unsqueeze(-1)).squeeze(-1)).sum(-1)
+        return ellipse_excess(value, matrix.diagonal(dim1=-2, dim2=-1).sum(-1), bound, self.dim)
+
+    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
+        return self._violation(obs, action).clamp(min=0.0)
+
+    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        _, _, [(matrix, middle, bound)] = self.explicit(obs)
+        offset = (-middle if center is None else center - middle).expand_as(direction)
+        bent = (matrix @ offset.unsqueeze(-1)).squeeze(-1)
+        inside = (bent * offset).sum(-1) < bound
+        require(inside.flatten(), "the centre is not inside the ellipse", name_samples(tuple(inside.shape)))
+        bent_direction = (matrix @ direction.unsqueeze(-1)).squeeze(-1)
+        return [ellipse_gauge_gradient(direction, bent_direction, offset, bent, bound.unsqueeze(-1))]

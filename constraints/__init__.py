@@ -1,5 +1,6 @@
 """Feasible action sets and differentiable maps onto them; usable on their own."""
 
+from constraints.ball import Ball
 from constraints.base import Constraint
 from constraints.box import Box
 from constraints.ellipse import DiagonalEllipse, PlanarEllipse
@@ -11,6 +12,7 @@ from constraints.quadratic import QuadraticConstraint
 from constraints.weighted import HalfSpace, WeightedL1, WeightedPositivePart
 
 __all__ = [
+    "Ball",
     "Box",
     "Constraint",
     "ConstraintError",

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import torch
 
 from constraints import (
+    Ball,
     Box,
     Constraint,
-    DiagonalEllipse,
     HalfSpace,
     PlanarEllipse,
     WeightedL1,
@@ -55,10 +55,6 @@ def _six_joint_sin2(obs):
     return torch.sin(obs[..., 2:8]).square()
 
 
-def _ones(obs):
-    return torch.ones_like(obs[..., :2])
-
-
 def _tip_matrix(obs):
     """Q (..., 2, 2) with a'Qa = a1^2 + 2 a1 (a1 + a2) cos(theta_2) + (a1 + a2)^2."""
     c = torch.cos(obs[..., 7])
@@ -87,7 +83,7 @@ TASKS = {
     ),
     "R+L2": Task(
         Reacher,
-        DiagonalEllipse(_ones, 0.05, 2),
+        Ball(0.05, 2),
         "sum of squared torques at most 0.05",
         r"a_1^2 + a_2^2 \leq 0.05",
         REACHER_STEPS,

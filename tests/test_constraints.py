@@ -15,6 +15,7 @@ from references import ReferenceSet, sign_rows, subset_rows
 from torch import Tensor
 
 from constraints import (
+    Ball,
     Box,
     Constraint,
     DiagonalEllipse,
@@ -108,7 +109,7 @@ class Task:
 
 TASKS = {
     "R+N": Task(Box(2), lambda w, theta: ReferenceSet(*no_rows(2)), linear=True),
-    "R+L2": Task(DiagonalEllipse(ones, 0.05, 2), lambda w, theta: ReferenceSet(*no_rows(2), np.eye(2), 0.05)),
+    "R+L2": Task(Ball(0.05, 2), lambda w, theta: ReferenceSet(*no_rows(2), np.eye(2), 0.05)),
     "R+O03": Task(WeightedL1(velocities, 0.3, 2), reference_l1(0.3), linear=True),
     "R+O10": Task(WeightedL1(velocities, 1.0, 2), reference_l1(1.0), linear=True),
     "R+O30": Task(WeightedL1(velocities, 3.0, 2), reference_l1(3.0), linear=True),
@@ -120,7 +121,8 @@ TASKS = {
     "H+O+S": Task(WeightedL1AndEllipse(velocities, 10.0, squared_sines, 0.1, 3), reference_both),
     "W+M": Task(WeightedPositivePart(velocities, 10.0, 6), reference_positive(10.0), linear=True),
     "W+O+S": Task(WeightedL1AndEllipse(velocities, 10.0, squared_sines, 0.1, 6), reference_both),
-    # Beyond the paper: an ellipse that the box cuts, with the degenerate angles below making some or all s_i = 0.
+    # Beyond the paper: the same disc as an ellipse, and an ellipse that the box cuts, with the degenerate angles below making some or all s_i = 0.
+    "disc": Task(DiagonalEllipse(ones, 0.05, 2), lambda w, theta: ReferenceSet(*no_rows(2), np.eye(2), 0.05)),
     "cut ellipse": Task(
         DiagonalEllipse(squared_sines, 0.4, 4),
         lambda w, theta: ReferenceSet(*no_rows(4), np.diag(np.sin(theta) ** 2), 0.4),

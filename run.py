@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import fields
 
+import torch
+
+import envs
+from algos import ALGORITHMS, NFWPO
 from core.config import (
     Config,
     ConfigError,
@@ -13,15 +18,16 @@ from core.config import (
     parse_arguments,
     parse_seeds,
     resolve,
+    saved_settings,
     split_names,
 )
+from core.results import RunWriter, describe_environment, is_finished, read_run, run_folder, variant_name
+from core.trainer import Trainer
+from envs import TASKS
 
 
 def usage() -> str:
     """The help text, made from the definitions of algorithms, tasks and settings."""
-    from algos import ALGORITHMS
-    from envs import TASKS
-
     lines = [
         "usage: python run.py algo=NAMES env=NAMES [key=value ...]",
         "",
@@ -42,9 +48,6 @@ def usage() -> str:
 
 def plan(arguments: list[str]) -> list[tuple[Config, Config]]:
     """The cells that the arguments ask for, each as (configuration, the paper's configuration of the same cell)."""
-    from algos import ALGORITHMS
-    from envs import TASKS
-
     overrides = parse_arguments(arguments)
     for key, choices in (("algo", ALGORITHMS), ("env", TASKS)):
         if key not in overrides:
@@ -68,9 +71,6 @@ def plan(arguments: list[str]) -> list[tuple[Config, Config]]:
 
 
 def _paper_config(name: str, task: str) -> Config:
-    from algos import ALGORITHMS, NFWPO
-    from envs import TASKS
-
     algorithm = ALGORITHMS[name]
     return defaults(
         algo=name,
@@ -83,15 +83,23 @@ def _paper_config(name: str, task: str) -> Config:
     )
 
 
+def make_trainer(config: Config, seeds: list[int], writers: Sequence[RunWriter], progress: bool = True) -> Trainer:
+    """The trainer of one cell: its environments and its agent put together; one writer a seed."""
+    algorithm = ALGORITHMS[config.algo]
+    train_envs = [envs.make(config.env) for _ in seeds]
+    agent = algorithm.agent(
+        config,
+        envs.constraint(config.env),
+        train_envs[0].observation_space.shape[0],
+        seeds,
+        mapping=algorithm.mapping,
+        placement=algorithm.placement,
+    )
+    return Trainer(config, agent, train_envs, lambda: envs.make(config.env), writers, progress)
+
+
 def train(config: Config, base: Config) -> None:
     """Run the seeds of one cell that have no finished run, and say what came out and where it is."""
-    import torch
-
-    import envs
-    from algos import ALGORITHMS
-    from core.results import RunWriter, describe_environment, is_finished, read_run, run_folder, variant_name
-    from core.trainer import Trainer, seed_config
-
     torch.set_num_threads(config.threads)
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     variant = variant_name(config.algo, differences(config, base))
@@ -106,38 +114,26 @@ def train(config: Config, base: Config) -> None:
     if not seeds:
         return
 
-    algorithm = ALGORITHMS[config.algo]
     info = describe_environment(["run.py", *sys.argv[1:]])
     writers = [
         RunWriter(
             run_folder(config.results, config.env, variant, seed),
-            seed_config(config, seed),
+            saved_settings(config, seed),
             info,
             config.eval_episodes,
             replace_finished=config.overwrite,
         )
         for seed in seeds
     ]
-    train_envs = [envs.make(config.env) for _ in seeds]
-    agent = algorithm.agent(
-        config,
-        envs.constraint(config.env),
-        train_envs[0].observation_space.shape[0],
-        seeds,
-        mapping=algorithm.mapping,
-        placement=algorithm.placement,
-    )
-    trainer = Trainer(config, agent, train_envs, lambda: envs.make(config.env), writers)
     try:
-        results = trainer.run()
+        results = make_trainer(config, seeds, writers).run()
     except KeyboardInterrupt:
         print(f"\ninterrupted; unfinished runs stay in {writers[0].folder.parent}", file=sys.stderr)
         raise
     for writer, result in zip(writers, results, strict=True):
         print(
             f"{writer.folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
-            f" (best of the evaluations: step {result['best_step']}; largest violation"
-            f" {result['largest_violation']:.1e})"
+            f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e})"
         )
 
 

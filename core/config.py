@@ -223,3 +223,9 @@ def differences(config: Config, base: Config) -> dict[str, object]:
     """The settings of `config` that make it another experiment than `base`, seeds apart."""
     names = [f.name for f in fields(Config) if f.name not in RUN_KEYS]
     return {name: getattr(config, name) for name in names if getattr(config, name) != getattr(base, name)}
+
+
+def saved_settings(config: Config, seed: int) -> dict[str, object]:
+    """The configuration of one seed as its run folder keeps it."""
+    settings = asdict(config) | {"seed": str(seed)}
+    return {key: value for key, value in settings.items() if key not in ("results", "overwrite")}

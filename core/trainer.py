@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
 from typing import Any
 
 import gymnasium
@@ -261,9 +260,3 @@ class Progress:
 
     def close(self) -> None:
         self.bar.close()
-
-
-def seed_config(config: Config, seed: int) -> Mapping[str, object]:
-    """The configuration of one seed as its run folder keeps it, without what does not matter to the result."""
-    kept = asdict(replace(config, seed=str(seed)))
-    return {key: value for key, value in kept.items() if key not in ("results", "overwrite")}

@@ -3,12 +3,9 @@
 import pytest
 import torch
 
-import envs
-from algos import ALGORITHMS
 from core.replay import Replay
 from core.results import RunWriter
-from core.trainer import Trainer
-from run import plan
+from run import make_trainer, plan
 
 
 class RecordingReplay(Replay):
@@ -27,18 +24,8 @@ def train(tmp_path, algo, env, seed, **settings):
     words = [f"algo={algo}", f"env={env}", f"seed={seed}", *(f"{k}={v}" for k, v in settings.items())]
     ((config, _),) = plan(words)
     seeds = [int(s) for s in str(seed).split(",")]
-    algorithm = ALGORITHMS[algo]
-    train_envs = [envs.make(env) for _ in seeds]
-    agent = algorithm.agent(
-        config,
-        envs.constraint(env),
-        train_envs[0].observation_space.shape[0],
-        seeds,
-        mapping=algorithm.mapping,
-        placement=algorithm.placement,
-    )
     writers = [RunWriter(tmp_path / f"{algo}-{seed}" / f"seed={s}", {}, {}, 1) for s in seeds]
-    trainer = Trainer(config, agent, train_envs, lambda: envs.make(env), writers, progress=False)
+    trainer = make_trainer(config, seeds, writers, progress=False)
     trainer.replay.__class__ = RecordingReplay
     trainer.replay.shown = []
     results = trainer.run()

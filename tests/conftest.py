@@ -1,0 +1,13 @@
+"""One thread a process, as the processes share the cores, and Hypothesis profiles: few examples by default,
+`HYPOTHESIS_PROFILE=long` for 1,000 a property."""
+
+import os
+
+import torch
+from hypothesis import settings
+
+settings.register_profile("ci", max_examples=40, deadline=None)
+settings.register_profile("long", max_examples=1000, deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+torch.set_num_threads(1)

@@ -134,6 +134,8 @@ class GeneralConstraint(Constraint):
         count = math.prod(lead)
         rows = rows.expand(*lead, m, d).reshape(count, m, d).cpu()
         bounds = bounds.expand(*lead, m).reshape(count, m).cpu()
+        # 0 <= 0 holds everywhere, with slack.
+        bounds = torch.where((rows == 0.0).all(-1) & (bounds == 0.0), 1.0, bounds)
         faces = torch.eye(d, dtype=rows.dtype).expand(len(rows), d, d)
         rows = torch.cat((rows, faces, -faces), 1)
         bounds = torch.cat((bounds, torch.ones(len(rows), 2 * d, dtype=rows.dtype)), 1)

@@ -52,8 +52,11 @@ class RowProblem:
         ahead = ahead.div_(width.clamp(min=_TINY).unsqueeze(-2)).clamp_(0.0, 1.0)  # share of the way, (..., 2d + 1, d)
 
         value = (ahead @ self._drop).squeeze(-1) + self._lowest  # row.a at each breakpoint; the first has lam = 0
-        above, upper = torch.where(value >= self.bound, value, torch.inf).min(-1, keepdim=True)
-        below, lower = torch.where(value <= self.bound, value, -torch.inf).max(-1, keepdim=True)
+        # Enclosed by lam and not by value: breakpoints far apart may have values equal to rounding.
+        over = value > self.bound
+        upper = torch.where(over, turns, -torch.inf).argmax(-1, keepdim=True)
+        lower = torch.where(over, torch.inf, turns).argmin(-1, keepdim=True)
+        above, below = value.gather(-1, upper), value.gather(-1, lower)
         # Measured from below, a coordinate that the row presses against 0 keeps its relative precision.
         share = (self.bound - below) / (above - below).clamp(min=_TINY)
         start = ahead.take_along_dim(upper.unsqueeze(-1), -2).squeeze(-2)

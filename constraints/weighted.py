@@ -57,11 +57,14 @@ class _WeightPatterns(Constraint):
         return RowProblem(target, self._row(weight, side), bound, (side - 1.0) / 2.0, (side + 1.0) / 2.0)
 
     def scaled_weight(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Weight (..., d) and bound (..., 1) divided by the largest |weight|, which may be 0 or 1e6."""
+        """Weight (..., d) and bound (..., 1) divided by the largest |weight|, which may be 0 or 1e6.
+
+        What is then below 1e-100 counts as 0: it moves the row by less than any rounding.
+        """
         weight = self.weight(obs)
         scale = weight.abs().amax(-1, keepdim=True)
         scale = torch.where(scale > 0.0, scale, 1.0)
-        return weight / scale, self.bound / scale
+        return torch.nn.functional.hardshrink(weight / scale, 1e-100), self.bound / scale
 
     def _excess(self, obs: Tensor, action: Tensor) -> Tensor:
         """Ax - b (..., m) with unit rows; a zero row stays as it is."""
@@ -159,6 +162,11 @@ class HalfSpace(_WeightPatterns):
         weight, bound = self.scaled_weight(obs)
         one = torch.ones_like(target)
         return RowProblem(target, self._row(weight, target), bound, -one, one)
+
+    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
+        # Where the gradient is 0 every value is as good: take the one that relieves the row.
+        relief = -1e-150 * self.scaled_weight(obs)[0]
+        return super()._linear_oracle(obs, torch.where(gradient == 0.0, relief, gradient))
 
     def _center(self, obs: Tensor) -> Tensor:
         weight, bound = self.scaled_weight(obs)

@@ -44,16 +44,16 @@ class ReferenceSet:
     def linear_oracle(self, gradient: np.ndarray) -> np.ndarray:
         return self._solve(np.zeros((self.dim, self.dim)), -gradient)
 
-    def normal_cone_residual(self, point: np.ndarray, outward: np.ndarray) -> float:
-        """Distance of `outward` to the normal cone at the feasible `point`.
+    def normal_cone_residual(self, point: np.ndarray, outward: np.ndarray, near: float = 1e-10) -> float:
+        """Distance of `outward` to the normal cone at the feasible `point`; constraints within `near` are active.
 
         A point is the projection of x where x - point is in its normal cone, and maximises <g, .> where g is. A
         residual r leaves it within |r| of the true projection: it is that of x - r, and projections do not expand.
         """
         rows = np.vstack((self._unit_rows(), np.eye(self.dim), -np.eye(self.dim)))
         excess = np.concatenate((self._row_excess(point), point - 1.0, -point - 1.0))
-        normals = rows[excess > -1e-10]
-        if self.matrix is not None and self._matrix_excess(point) > -1e-10:
+        normals = rows[excess > -near]
+        if self.matrix is not None and self._matrix_excess(point) > -near:
             normal = self.matrix @ point
             normals = np.vstack((normals, normal / np.linalg.norm(normal)))
         size = np.linalg.norm(outward)

@@ -497,7 +497,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[Path, dict[str, str]]:
         raise ConfigError(
             f"expected one folder of results, got {len(folders)}: {' '.join(folders) or 'none'}"
         )
-    return Path(folders[0]), options
+    return Path(folders[0]).expanduser(), options
 
 
 def run(arguments: Sequence[str]) -> None:

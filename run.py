@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import fields
+from pathlib import Path
 
 import torch
 
@@ -103,30 +104,23 @@ def train(config: Config, base: Config) -> None:
     torch.set_num_threads(config.threads)
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     variant = variant_name(config.algo, differences(config, base))
-    seeds = []
+    folders = {}
     for seed in parse_seeds(config.seed):
         folder = run_folder(config.results, config.env, variant, seed)
         if is_finished(folder) and not config.overwrite:
-            mean = read_run(folder).result["return_mean"]
-            print(f"{folder}: already finished, return {mean:.2f} (overwrite=true runs it again and keeps the old)")
+            print(f"{folder}: already finished{_result_of(folder)} (overwrite=true runs it again and keeps the old)")
         else:
-            seeds.append(seed)
-    if not seeds:
+            folders[seed] = folder
+    if not folders:
         return
 
     info = describe_environment(["run.py", *sys.argv[1:]])
     writers = [
-        RunWriter(
-            run_folder(config.results, config.env, variant, seed),
-            saved_settings(config, seed),
-            info,
-            config.eval_episodes,
-            replace_finished=config.overwrite,
-        )
-        for seed in seeds
+        RunWriter(folder, saved_settings(config, seed), info, config.eval_episodes, replace_finished=config.overwrite)
+        for seed, folder in folders.items()
     ]
     try:
-        results = make_trainer(config, seeds, writers).run()
+        results = make_trainer(config, list(folders), writers).run()
     except KeyboardInterrupt:
         print(f"\ninterrupted; unfinished runs stay in {writers[0].folder.parent}", file=sys.stderr)
         raise
@@ -135,6 +129,13 @@ def train(config: Config, base: Config) -> None:
             f"{writer.folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
             f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e})"
         )
+
+
+def _result_of(folder: Path) -> str:
+    try:
+        return f", return {read_run(folder).result['return_mean']:.2f}"
+    except ValueError as error:
+        return f", but unreadable ({error})"
 
 
 def main(arguments: list[str]) -> int:

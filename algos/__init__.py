@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from algos.nfwpo import NFWPO
 from algos.sac import SAC
 from algos.td3 import TD3
-from core.agent import Agent, Mapping, Placement
+from core.agent import Agent, MapName, Placement
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Algorithm:
     """One column of the paper's table."""
 
     agent: type[Agent]
-    mapping: Mapping
+    mapping: MapName
     placement: Placement
     penalty: bool = False
 

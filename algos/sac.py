@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from constraints import Constraint
-from core.agent import Agent
+from core.agent import Agent, MapName, Placement
 from core.config import Config
 from core.networks import MLP, TwinCritic, adam, descend, frozen_copy, rows_of, soft_update
 from core.random import Streams
@@ -82,8 +82,17 @@ class StateDependentActor(nn.Module):
 class SAC(Agent):
     """Soft actor-critic for all seeds at once; tensors are (seeds, batch, features)."""
 
-    def __init__(self, config: Config, constraint: Constraint, obs_dim: int, seeds: Sequence[int], **placement):
-        super().__init__(config, constraint, obs_dim, seeds, **placement)
+    def __init__(
+        self,
+        config: Config,
+        constraint: Constraint,
+        obs_dim: int,
+        seeds: Sequence[int],
+        *,
+        mapping: MapName,
+        placement: Placement,
+    ):
+        super().__init__(config, constraint, obs_dim, seeds, mapping=mapping, placement=placement)
         init = Streams(seeds, "init").generators
         actor_class = StateDependentActor if config.gsde else GaussianActor
         self.actor = actor_class(obs_dim, self.action_dim, config.hidden, init)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from constraints import Constraint
-from core.agent import Agent
+from core.agent import Agent, MapName, Placement
 from core.config import Config
 from core.networks import MLP, TwinCritic, adam, descend, frozen_copy, rows_of, soft_update
 from core.random import Streams
@@ -23,8 +23,17 @@ from core.replay import Batch
 class TD3(Agent):
     """Twin delayed DDPG for all seeds at once; tensors are (seeds, batch, features)."""
 
-    def __init__(self, config: Config, constraint: Constraint, obs_dim: int, seeds: Sequence[int], **placement):
-        super().__init__(config, constraint, obs_dim, seeds, **placement)
+    def __init__(
+        self,
+        config: Config,
+        constraint: Constraint,
+        obs_dim: int,
+        seeds: Sequence[int],
+        *,
+        mapping: MapName,
+        placement: Placement,
+    ):
+        super().__init__(config, constraint, obs_dim, seeds, mapping=mapping, placement=placement)
         init = Streams(seeds, "init").generators
         self.actor = MLP([obs_dim, *config.hidden, self.action_dim], init)
         self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init)

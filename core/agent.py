@@ -14,7 +14,7 @@ from core.config import Config
 from core.random import Streams
 from core.replay import Batch
 
-Mapping = Literal["project", "alpha", "radial"]
+MapName = Literal["project", "alpha", "radial"]
 Placement = Literal["environment", "rollout", "layer"]
 
 
@@ -37,7 +37,7 @@ class Agent(ABC):
         obs_dim: int,
         seeds: Sequence[int],
         *,
-        mapping: Mapping,
+        mapping: MapName,
         placement: Placement,
     ):
         self.config, self.constraint = config, constraint

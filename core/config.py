@@ -161,19 +161,22 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def _typed(key: str, text: str) -> object:
-    """The text of one override as the type of its field; ConfigError if it has no such value."""
+    """The text of one override, made ready for the type check of its field."""
     kind = typing.get_type_hints(Config)[key]
-    if kind is str:
-        return text
+    if typing.get_origin(kind) is list:
+        return [_whole(part) for part in text.removeprefix("[").removesuffix("]").split(",")]
+    if int in (kind, *typing.get_args(kind)):
+        return _whole(text)
+    return str(int(text)) if key == "train_freq" and text.isdecimal() else text
+
+
+def _whole(text: str) -> int | str:
+    """3e5 is a whole number to a person; what is none is left to the type check."""
     try:
-        value = OmegaConf.from_dotlist([f"value={text}"]).value
-    except (OmegaConfBaseException, ValueError) as error:
-        raise ConfigError(f"bad value {text!r} for {key}: {str(error).splitlines()[0]}") from None
-    if kind is list[int] or typing.get_origin(kind) is list:
-        value = value if OmegaConf.is_list(value) else [int(v) if v.isdecimal() else v for v in text.split(",")]
-    if int in (kind, *typing.get_args(kind)) and isinstance(value, float) and value.is_integer():
-        value = int(value)  # 3e5 is a whole number to a person, a float to YAML
-    return value
+        number = float(text)
+    except ValueError:
+        return text
+    return int(number) if number.is_integer() else text
 
 
 def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
@@ -213,7 +216,7 @@ def _check_ranges(config: Config) -> None:
     demand("learning_rate", config.learning_rate > 0, "must be positive")
     demand("fw_learning_rate", 0 < (config.fw_learning_rate or 1.0) <= 1, "must be in (0, 1]")
     demand("policy_delay", (config.policy_delay or 1) >= 1, "must be at least 1")
-    demand("hidden", len(config.hidden) >= 1 and min(config.hidden) >= 1, "must list positive widths")
+    demand("hidden", min(config.hidden) >= 1, "must list positive widths")
     demand("gradient_steps", config.gradient_steps == -1 or config.gradient_steps >= 1, "must be -1 or at least 1")
     freq = config.train_freq
     demand("train_freq", freq == "episode" or (freq.isdecimal() and int(freq) >= 1), "must be steps or 'episode'")

@@ -57,7 +57,7 @@ def run_folder(root: str | Path, task: str, variant: str, seed: int) -> Path:
     for name in (task, variant):
         if not name or name.startswith(".") or "/" in name or os.sep in name:
             raise ValueError(f"{name!r} cannot name a run's folder: empty, or with a leading '.' or a '/'")
-    return Path(root, task, variant, f"seed={seed}")
+    return Path(root, task, variant, f"seed={seed}").expanduser()
 
 
 def is_finished(folder: str | Path) -> bool:

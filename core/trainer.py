@@ -6,6 +6,7 @@ the arithmetic: seeds that owe gradient steps wait until all do, and then take t
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -40,7 +41,7 @@ class Trainer:
         self.config, self.agent, self.writers = config, agent, writers
         self.seeds = agent.seeds
         self.envs = envs
-        self.evaluator = Evaluator(make_env, self.seeds, min(config.eval_episodes, config.final_episodes))
+        self.evaluator = Evaluator(make_env, self.seeds, config.eval_episodes)
         self.replay = Replay(
             self.seeds,
             min(config.buffer_size, config.steps),
@@ -60,13 +61,13 @@ class Trainer:
         self.progress = Progress(config, count, progress)
 
     def run(self) -> list[dict]:
-        """Train every seed to the end; the results, one dict a seed. An interrupt saves the parameters first."""
+        """Train every seed to the end; the results, one dict a seed. Whatever ends it early, parameters are saved."""
         try:
             self._begin()
             while len(self.results) < len(self.seeds):
                 self._collect()
                 self._learn()
-        except KeyboardInterrupt:
+        except BaseException:
             for i in set(range(len(self.seeds))) - self.results.keys():
                 self.writers[i].save_parameters("last", self.agent.state(i))
             raise
@@ -187,18 +188,23 @@ class Trainer:
         for i, seed_returns in zip(which, returns, strict=True):
             self.writers[i].append_evaluation(self.steps[i], seed_returns, time.perf_counter() - self.started)
             mean = float(seed_returns.mean())
-            if self.best[i] is None or mean > self.best[i][0]:
+            if self.best[i] is None or mean > self.best[i][0] or math.isnan(self.best[i][0]):
                 self.best[i] = mean, self.steps[i], self.agent.state(i)
                 self.writers[i].save_parameters("best", self.best[i][2])
         self.progress.show_evaluation(float(returns.mean()), [best[0] for best in self.best if best])
 
     def _finish(self, which: Sequence[int]) -> None:
         """Write the last parameters, evaluate the best ones at length, and write the result."""
+        last = {i: self.agent.state(i) for i in which}
         for i in which:
-            self.writers[i].save_parameters("last", self.agent.state(i))
+            self.writers[i].save_parameters("last", last[i])
             self.agent.load_state(i, self.best[i][2])
+        policy = self.agent.policy(which)  # a copy of the best parameters
+        for i in which:
+            self.agent.load_state(i, last[i])
+        self.progress.show_final_evaluation()
         with self._timed("evaluation"):
-            returns = self.evaluator.run(self.agent.policy(which), which, self.config.final_episodes)
+            returns = self.evaluator.run(policy, which, self.config.final_episodes)
         for i, seed_returns in zip(which, returns, strict=True):
             envs: list[Any] = [env.unwrapped for env in (self.envs[i], *self.evaluator.of_seed(i))]
             self.results[i] = {
@@ -257,6 +263,9 @@ class Progress:
 
     def show_evaluation(self, last: float, best: Sequence[float]) -> None:
         self.bar.set_postfix(last=f"{last:.2f}", best=f"{np.mean(best):.2f}", refresh=False)
+
+    def show_final_evaluation(self) -> None:
+        self.bar.set_description(f"{self.name} final evaluation")
 
     def close(self) -> None:
         self.bar.close()

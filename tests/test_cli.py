@@ -57,8 +57,13 @@ def test_usage_names_every_algorithm_task_and_key(capsys, arguments):
         ("algo=SRad env=W+M gamma=nan", "must be finite"),
         ("algo=SRad env=W+M tau=0", "in (0, 1]"),
         ("algo=SRad env=W+M learning_rate=-1", "must be positive"),
-        ("algo=SRad env=W+M hidden=[]", "positive widths"),
+        ("algo=SRad env=W+M hidden=[]", "bad value '[]' for hidden: expected list"),
+        ("algo=SRad env=W+M hidden=[8,0]", "positive widths"),
         ("algo=SRad env=W+M hidden=[a]", "bad value '[a]' for hidden"),
+        ("algo=SRad env=W+M hidden=[1,2]]", "bad value '[1,2]]' for hidden"),
+        ("algo=SRad env=W+M gamma={", "bad value '{' for gamma: expected float"),
+        ("algo=SRad env=W+M steps=1:30", "bad value '1:30' for steps: expected int"),
+        ("algo=SRad env=W+M gamma=", "expected key=value"),
         ("algo=SRad env=W+M train_freq=never", "steps or 'episode'"),
         ("algo=SRad env=W+M gradient_steps=-2", "-1 or at least 1"),
         ("algo=SRad env=W+M batch_size=null", "a value is needed"),
@@ -84,6 +89,8 @@ def test_results_folder_that_cannot_be_made(capsys, tmp_path):
 def test_numbers_as_people_write_them():
     ((config, _),) = run.plan(["algo=SRad", "env=W+M", "steps=3e5", "hidden=64,32", "learning_rate=1e-3"])
     assert (config.steps, config.hidden, config.learning_rate) == (300_000, [64, 32], 1e-3)
+    ((config, _),) = run.plan(["algo=SRad", "env=W+M", "steps=010", "hidden=[1e2,32]", "train_freq=08"])
+    assert (config.steps, config.hidden, config.train_freq) == (10, [100, 32], "8")
 
 
 def test_seeds():

@@ -170,6 +170,9 @@ class Constraint:
         """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction)."""
         obs64, gradient64 = self._broadcast(obs, gradient.detach())
         with torch.no_grad():
+            # Only the direction matters: at length 1 the squares of tiny gradients stay above zero.
+            largest = gradient64.abs().amax(-1, keepdim=True)
+            gradient64 = gradient64 / torch.where(largest > 0.0, largest, 1.0)
             return _keep_nan(self._linear_oracle(obs64, gradient64), gradient64).to(gradient.dtype)
 
     # ---------------------------------------------------------------- shared pieces

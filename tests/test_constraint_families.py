@@ -98,6 +98,8 @@ def problems(draw, largest, smallest=1):
 def case(name, data):
     largest, build, refer = FAMILIES[name]
     w, s, x, b = data.draw(problems(largest, 2 if name == "planar ellipse" else 1))
+    if name == "planar ellipse":  # its matrix has the squares of w
+        w = w.clip(-1e3, 1e3)
     obs = torch.from_numpy(np.concatenate((w, s)))
     return build(len(w), b), refer(w, s, b), obs, torch.from_numpy(x)
 
@@ -113,7 +115,7 @@ def test_projection(name, data):
     assert residual <= (1e-6 if name == "planar ellipse" else 1e-8) * max(1.0, x.abs().max().item())
     # The same through batches, and with leading axes
     again = constraint.project(obs.expand(2, 3, -1), x.expand(2, 3, -1))
-    torch.testing.assert_close(again, point.expand(2, 3, -1), rtol=0.0, atol=1e-8)
+    torch.testing.assert_close(again, point.expand(2, 3, -1), rtol=0.0, atol=NEAR)
 
 
 @every_family

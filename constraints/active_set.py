@@ -39,6 +39,9 @@ def project_on_rows(
     pending = torch.zeros(count, dtype=torch.bool)
     tolerance = 1e-12 + 1e-15 * target.abs().amax(-1)
 
+    if count == 0:
+        return solution, multipliers
+
     for _ in range(50 * (m + dim)):
         excess = (rows @ point.unsqueeze(-1)).squeeze(-1) - limits
         entering = torch.where(pending, entering, excess.argmax(-1))
@@ -73,8 +76,9 @@ def project_on_rows(
         stuck = until_drop.isinf() & until_met.isinf()
         if bool((stuck & (over > _EMPTY)).any()):
             first = int((stuck & (over > _EMPTY)).nonzero()[0])
-            row = int(entering[first])
-            where = f", row {row}" if row < named else ""
+            # The row that cannot be met or one of those in its way, the box's aside.
+            conflict = [row for row in [int(entering[first]), *index[first].tolist()] if 0 <= row < named]
+            where = f", row {conflict[0]}" if conflict else ""
             raise ConstraintError(f"{name(int(sample[first]))}{where}: the set is empty")
         # A dependent row that the active ones meet up to rounding is met.
         limits[stuck.nonzero().squeeze(-1), entering[stuck]] += over[stuck].clamp(min=0.0) + tolerance[stuck]

@@ -24,6 +24,8 @@ from constraints.base import Constraint, JacobianProduct, box_gauge_gradient, la
 from constraints.errors import ConstraintError, SampleName, name_samples, require
 from constraints.interior_point import minimize
 
+# A centre given for a gauge that is nearer than this to the boundary is on it, up to rounding.
+ON_BOUNDARY = 1e-12
 # A centre nearer to the boundary than this gives way to the deepest point.
 _NEAR_BOUNDARY = 1e-6
 # A set whose deepest point is no deeper than this has no interior.
@@ -91,7 +93,7 @@ class GeneralConstraint(Constraint):
 
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         if center is not None:
-            inside = center.abs().amax(-1) < 1.0
+            inside = center.abs().amax(-1) < 1.0 - ON_BOUNDARY
             require(inside.flatten(), "the centre is not inside the box", name_samples(tuple(inside.shape)))
             center = center.expand_as(direction)
         box = box_gauge_gradient(direction, center)
@@ -291,7 +293,7 @@ def _pinned(normals: Tensor) -> Tensor:
     cone = normals[present].T.numpy()
     for i in present.tolist():
         wanted = -normals[i].numpy()
-        pinned[i] = nnls(cone, wanted)[1] <= 1e-7 * np.linalg.norm(wanted)
+        pinned[i] = bool(nnls(cone, wanted)[1] <= 1e-7 * np.linalg.norm(wanted))
     return pinned
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from constraints.base import Constraint, ExplicitSet
 from constraints.errors import name_samples, require
-from constraints.general import GeneralConstraint, check_obs
+from constraints.general import ON_BOUNDARY, GeneralConstraint, check_obs
 
 
 class Intersection(GeneralConstraint):
@@ -50,7 +50,7 @@ class Intersection(GeneralConstraint):
         for constraint in self.constraints:
             # The closed forms take the centre's word for it.
             if not isinstance(constraint, GeneralConstraint) and center is not None:
-                inside = constraint._violation(obs, center) < 0.0
+                inside = constraint._violation(obs, center) < -ON_BOUNDARY
                 require(inside.flatten(), "the centre is not interior", name_samples(tuple(inside.shape)))
             gradients.append(constraint._gauge_and_gradient(obs, direction, center)[1])
         return gradients

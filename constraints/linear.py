@@ -9,7 +9,7 @@ from torch import Tensor
 
 from constraints.base import ExplicitSet, safe_sqrt
 from constraints.errors import name_samples, require
-from constraints.general import GeneralConstraint, check_obs, checked, unit_rows
+from constraints.general import ON_BOUNDARY, GeneralConstraint, check_obs, checked, unit_rows
 
 
 class LinearConstraint(GeneralConstraint):
@@ -69,7 +69,7 @@ class LinearConstraint(GeneralConstraint):
             slack = slack - (rows @ center.unsqueeze(-1)).squeeze(-1)
         # 0 <= 0 holds everywhere.
         vacuous = (rows == 0.0).all(-1) & (slack >= 0.0)
-        inside = vacuous | (slack > 0.0)
+        inside = vacuous | (slack > ON_BOUNDARY)
         require(inside.reshape(-1, m), "the centre is not inside this row", name_samples(tuple(lead)))
         normals = rows / torch.where(vacuous, 1.0, slack).unsqueeze(-1)
         first = (normals @ direction.detach().unsqueeze(-1)).argmax(-2, keepdim=True)

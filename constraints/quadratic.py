@@ -10,7 +10,7 @@ from torch import Tensor
 from constraints.base import ExplicitSet
 from constraints.ellipse import ellipse_excess, ellipse_gauge_gradient
 from constraints.errors import name_samples, require
-from constraints.general import GeneralConstraint, check_obs, checked
+from constraints.general import ON_BOUNDARY, GeneralConstraint, check_obs, checked
 
 Coefficient = Callable[[Tensor], Tensor]
 
@@ -77,7 +77,7 @@ class QuadraticConstraint(GeneralConstraint):
         _, _, [(matrix, middle, bound)] = self.explicit(obs)
         offset = (-middle if center is None else center - middle).expand_as(direction)
         bent = (matrix @ offset.unsqueeze(-1)).squeeze(-1)
-        inside = (bent * offset).sum(-1) < bound
+        inside = (bent * offset).sum(-1) < bound * (1.0 - ON_BOUNDARY)
         require(inside.flatten(), "the centre is not inside the ellipse", name_samples(tuple(inside.shape)))
         bent_direction = (matrix @ direction.unsqueeze(-1)).squeeze(-1)
         return [ellipse_gauge_gradient(direction, bent_direction, offset, bent, bound.unsqueeze(-1))]

@@ -49,9 +49,7 @@ COLORS = {
 }
 FAMILIES = {"TD3 family": list(COLORS)[:9], "SAC family": list(COLORS)[9:]}
 # Without constraints a penalty is zero and a projection the identity, so the paper trains one of each family.
-SAME_WITHOUT_CONSTRAINT = dict.fromkeys(("DPro+", "DPre", "DPre+", "DOpt", "DOpt+"), "DPro") | {
-    "SPre+": "SPre"
-}
+SAME_WITHOUT_CONSTRAINT = dict.fromkeys(("DPro+", "DPre", "DPre+", "DOpt", "DOpt+"), "DPro") | {"SPre+": "SPre"}
 PAPER_SEEDS = 10
 FORMATS = ("md", "csv", "tex", "png", "pdf")
 MISSING = "–"
@@ -126,9 +124,7 @@ def group_runs(runs: Iterable[Run]) -> Groups:
         differing = [key for key in keys if any(c.get(key) != configs[0].get(key) for c in configs)]
         for config, members in zip(configs, by_config.values(), strict=True):
             settings = members[0].overrides | {key: _text(config.get(key)) for key in differing}
-            condition = Condition(
-                task, ", ".join(f"{key}={value}" for key, value in sorted(settings.items()))
-            )
+            condition = Condition(task, ", ".join(f"{key}={value}" for key, value in sorted(settings.items())))
             groups[condition][members[0].algo] = sorted(members, key=lambda run: run.seed)
     return groups
 
@@ -168,9 +164,7 @@ def read_paper() -> dict[tuple[str, str, str], Statistic]:
     """The paper's Table "Average Rewards" by (task, batch, algorithm); batch is "16" or "default"."""
     with open(Path(__file__).parent / "core" / "paper_table.csv", newline="") as file:
         return {
-            (row["task"], row["batch"], row["algo"]): Statistic(
-                float(row["mean"]), float(row["se"]), PAPER_SEEDS
-            )
+            (row["task"], row["batch"], row["algo"]): Statistic(float(row["mean"]), float(row["se"]), PAPER_SEEDS)
             for row in csv.DictReader(file)
         }
 
@@ -196,8 +190,7 @@ def order_conditions(conditions: Iterable[Condition]) -> list[list[Condition]]:
     for task, settings in conditions:
         by_settings[settings].append(task)
     return [
-        [Condition(task, settings) for task in order_tasks(tasks)]
-        for settings, tasks in sorted(by_settings.items())
+        [Condition(task, settings) for task in order_tasks(tasks)] for settings, tasks in sorted(by_settings.items())
     ]
 
 
@@ -282,19 +275,14 @@ def to_terminal(table: Table, bold: bool, width: int | None) -> str:
     """Plain text without the empty columns; those beyond `width` characters (None: no limit) go below."""
     rows = [row for section in table.sections for row in section]
     widths = [
-        max([len(head), *(len(line) for row in rows for line in row[j].lines)])
-        for j, head in enumerate(table.header)
+        max([len(head), *(len(line) for row in rows for line in row[j].lines)]) for j, head in enumerate(table.header)
     ]
     labels = list(range(table.labels))
     blocks: list[list[int]] = [[*labels]]
     for j in range(table.labels, len(table.header)):
         if all(row[j].missing for row in rows):
             continue
-        if (
-            width
-            and len(blocks[-1]) > table.labels
-            and sum(widths[i] + 2 for i in [*blocks[-1], j]) - 2 > width
-        ):
+        if width and len(blocks[-1]) > table.labels and sum(widths[i] + 2 for i in [*blocks[-1], j]) - 2 > width:
             blocks.append([*labels])
         blocks[-1].append(j)
 
@@ -360,9 +348,7 @@ def to_latex(table: Table) -> str:
             for i in range(height):
                 texts = [text(cell.lines[i]) if i < len(cell.lines) else "" for cell in row]
                 emphasis = [cell.bold and i == 0 for cell in row]
-                body.append(
-                    line([rf"\textbf{{{t}}}" if on else t for t, on in zip(texts, emphasis, strict=True)])
-                )
+                body.append(line([rf"\textbf{{{t}}}" if on else t for t, on in zip(texts, emphasis, strict=True)]))
     body += [r"\bottomrule", r"\end{tabular}"]
     preamble = ["\\documentclass[border=4pt]{standalone}", "\\usepackage{booktabs}", "\\begin{document}"]
     return "\n".join([f"% {table.title}", *preamble, *body, r"\end{document}"]) + "\n"
@@ -430,9 +416,7 @@ def write_figures(groups: Groups, folder: Path, formats: Sequence[str]) -> list[
     written = []
     for condition in chain.from_iterable(order_conditions(groups)):
         by_algo = {
-            algo: runs
-            for algo, runs in groups[condition].items()
-            if any(len(run.evaluations.step) for run in runs)
+            algo: runs for algo, runs in groups[condition].items() if any(len(run.evaluations.step) for run in runs)
         }
         if not by_algo:
             continue
@@ -441,9 +425,7 @@ def write_figures(groups: Groups, folder: Path, formats: Sequence[str]) -> list[
             runs = by_algo[algo]
             steps, mean, error = learning_curve(runs)
             axes.plot(steps, mean, label=_legend(algo, runs), **_style(algo, len(steps)))
-            axes.fill_between(
-                steps, mean - error, mean + error, color=_style(algo, 0)["color"], alpha=0.15, lw=0
-            )
+            axes.fill_between(steps, mean - error, mean + error, color=_style(algo, 0)["color"], alpha=0.15, lw=0)
         axes.set_title(condition.label)
         axes.set_xlabel("Environment steps")
         axes.set_ylabel("Evaluation return (mean ± standard error)")
@@ -494,9 +476,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[Path, dict[str, str]]:
             raise ConfigError(f"key {key!r} given twice: {options[key]!r} and {value!r}")
         options[key] = value
     if len(folders) != 1:
-        raise ConfigError(
-            f"expected one folder of results, got {len(folders)}: {' '.join(folders) or 'none'}"
-        )
+        raise ConfigError(f"expected one folder of results, got {len(folders)}: {' '.join(folders) or 'none'}")
     return Path(folders[0]).expanduser(), options
 
 

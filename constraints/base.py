@@ -89,7 +89,7 @@ class Constraint:
         return torch.maximum(box, self._violation(obs64, action64)).to(action.dtype)
 
     def penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Penalty (...) of the '+' algorithms on a box action (paper, Sec. 4.1): the norm of max(Ax - b, 0) with unit
+        """Penalty (...) of the '+' algorithms on a box action (paper, "Algorithms"): the norm of max(Ax - b, 0) with unit
         rows, max(sqrt(x'Qx) - sqrt(b), 0) with tr Q = dim, and the sum where both are present."""
         obs64, action64 = self._broadcast(obs, action)
         return self._penalty(obs64, action64).to(action.dtype)
@@ -106,7 +106,7 @@ class Constraint:
 
     def center(self, obs: Tensor) -> Tensor:
         """Interior point (..., d): Chebyshev centre of a linear set, an ellipse's centre otherwise, the origin where
-        both are present (paper, Sec. 3.3.1)."""
+        both are present (paper, "alpha-Projection Layer")."""
         with torch.no_grad():
             center = self._center(obs.detach().double())
             return center.expand(*obs.shape[:-1], self.dim).to(obs.dtype)
@@ -144,7 +144,7 @@ class Constraint:
     def alpha_log_prob(
         self, obs: Tensor, action: Tensor, mean: Tensor, std: Tensor, center: Tensor | None = None
     ) -> Tensor:
-        """Log-density (...) of `alpha_map(obs, action)` for `action` ~ N(mean, diag std^2) (paper, Sec. 3.4.2).
+        """Log-density (...) of `alpha_map(obs, action)` for `action` ~ N(mean, diag std^2) (paper, "alpha-projection with SAC").
 
         With respect to volume where `action` is feasible, to the boundary's surface measure where it is not.
         """

@@ -89,8 +89,8 @@ class Constraint:
         return torch.maximum(box, self._violation(obs64, action64)).to(action.dtype)
 
     def penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Penalty (...) of the '+' algorithms on a box action (paper, "Algorithms"): the norm of max(Ax - b, 0) with unit
-        rows, max(sqrt(x'Qx) - sqrt(b), 0) with tr Q = dim, and the sum where both are present."""
+        """Penalty (...) of the '+' algorithms on a box action (paper, "Algorithms"): the norm of max(Ax - b, 0) with
+        unit rows, max(sqrt(x'Qx) - sqrt(b), 0) with tr Q = dim, and the sum where both are present."""
         obs64, action64 = self._broadcast(obs, action)
         return self._penalty(obs64, action64).to(action.dtype)
 
@@ -144,7 +144,9 @@ class Constraint:
     def alpha_log_prob(
         self, obs: Tensor, action: Tensor, mean: Tensor, std: Tensor, center: Tensor | None = None
     ) -> Tensor:
-        """Log-density (...) of `alpha_map(obs, action)` for `action` ~ N(mean, diag std^2) (paper, "alpha-projection with SAC").
+        """Log-density (...) of `alpha_map(obs, action)` for `action` ~ N(mean, diag std^2).
+
+        Source: paper, "alpha-projection with SAC", with the solid angle of dimension d.
 
         With respect to volume where `action` is feasible, to the boundary's surface measure where it is not.
         """

@@ -121,8 +121,8 @@ TASKS = {
     "H+O+S": Task(WeightedL1AndEllipse(velocities, 10.0, squared_sines, 0.1, 3), reference_both),
     "W+M": Task(WeightedPositivePart(velocities, 10.0, 6), reference_positive(10.0), linear=True),
     "W+O+S": Task(WeightedL1AndEllipse(velocities, 10.0, squared_sines, 0.1, 6), reference_both),
-    # Beyond the paper: the disc as an ellipse, and an ellipse that the box cuts, with the degenerate angles below making
-    # some or all s_i = 0.
+    # Beyond the paper: the disc as an ellipse, and an ellipse that the box cuts; the degenerate angles below make some
+    # or all s_i = 0.
     "disc": Task(DiagonalEllipse(ones, 0.05, 2), lambda w, theta: ReferenceSet(*no_rows(2), np.eye(2), 0.05)),
     "cut ellipse": Task(
         DiagonalEllipse(squared_sines, 0.4, 4),

@@ -1,0 +1,453 @@
+"""Inside the algorithms: each gradient of each name against the paper's formula, written out seed by seed."""
+
+from copy import deepcopy
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.distributions import Normal
+
+from algos import ALGORITHMS
+from algos.sac import StateDependentActor
+from constraints import Box, WeightedPositivePart
+from core.config import defaults
+from core.random import Streams
+from core.replay import Batch
+
+SEEDS, OBS, DIM, BATCH = [3, 8], 3, 2, 12
+CONSTRAINT = WeightedPositivePart(lambda obs: 2.0 * obs[..., :DIM] + 3.0, 0.8, DIM)  # its centre is not the origin
+TD3_NAMES = [name for name, algorithm in ALGORITHMS.items() if algorithm.base == "TD3"]
+SAC_NAMES = [name for name, algorithm in ALGORITHMS.items() if algorithm.base == "SAC"]
+CASES = [(name, False) for name in ALGORITHMS] + [(name, True) for name in SAC_NAMES]
+IDS = [name + (" with gSDE" if gsde else "") for name, gsde in CASES]
+
+
+def make_agent(name, gsde=False, constraint=CONSTRAINT, seeds=SEEDS, **settings):
+    """An agent with small networks whose outputs are not small, so that maps and clips all matter."""
+    algorithm = ALGORITHMS[name]
+    paper = defaults(
+        name, "W+M", "Reacher" if gsde else "Walker2d", algorithm.base, name == "NFW", algorithm.penalty, 1
+    )
+    settings = {"gamma": 0.9, "hidden": [8, 8], "tau": 0.1} | settings
+    if algorithm.base == "TD3":
+        settings = {"target_noise": 1.0, "target_noise_clip": 0.6} | settings
+    if algorithm.penalty:
+        settings = {"penalty": 1.5} | settings
+    if name == "NFW":
+        settings = {"fw_learning_rate": 0.3} | settings
+    agent = algorithm.agent(
+        replace(paper, **settings),
+        constraint,
+        OBS,
+        list(seeds),
+        mapping=algorithm.mapping,
+        placement=algorithm.placement,
+    )
+    generator = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for parameter in [p for module in agent.networks().values() for p in module.parameters()]:
+            parameter.add_(0.4 * torch.randn(parameter.shape, generator=generator))
+        for critic in (agent.critic, agent.critic_target):
+            critic.net.layers[-1].bias[len(seeds) :] -= 1.1  # so that now one, now the other is the smaller
+    return agent
+
+
+def make_batch(seed=0):
+    """Transitions with ends and time limits, stored actions of any kind, and stored centres that no formula gives."""
+    generator = torch.Generator().manual_seed(seed)
+    obs, next_obs = (torch.randn(len(SEEDS), BATCH, OBS, generator=generator) for _ in range(2))
+    action = torch.rand(len(SEEDS), BATCH, DIM, generator=generator) * 2 - 1
+    reward = torch.randn(len(SEEDS), BATCH, generator=generator)
+    terminated = (torch.arange(BATCH) % 3 == 0).float().expand(len(SEEDS), -1)
+    # Interior, as the origin and the Chebyshev centre are, but neither of the two.
+    center, next_center = 0.5 * CONSTRAINT.center(obs), 0.7 * CONSTRAINT.center(next_obs)
+    return Batch(obs, action, reward, terminated, next_obs, center, next_center)
+
+
+# ---------------------------------------------------------------- the formulas, for one seed: obs (batch, n)
+
+
+def mlp(net, row, x):
+    """The network of one row, layer by layer."""
+    for number, layer in enumerate(net.layers):
+        x = (x.relu() if number else x) @ layer.weight[row] + layer.bias[row]
+    return x
+
+
+def q_values(critic, i, obs, action):
+    """(2, batch): both critics of the seed in position i."""
+    x = torch.cat([obs, action], -1)
+    return torch.stack([mlp(critic.net, j * len(SEEDS) + i, x).squeeze(-1) for j in range(2)])
+
+
+def deterministic(agent, actor, i, obs, center):
+    """A TD3 actor's suggestion and what its map makes of it."""
+    raw = mlp(actor, i, obs)
+    if agent.mapping == "project":
+        return raw.tanh(), CONSTRAINT.project(obs, raw.tanh())
+    return raw, (CONSTRAINT.alpha_map if agent.mapping == "alpha" else CONSTRAINT.radial_map)(obs, raw, center)
+
+
+def moments(agent, actor, i, obs):
+    """Mean, standard deviation and (gSDE) latent features of a SAC actor's Gaussian."""
+    if not agent.config.gsde:
+        mean, log_std = mlp(actor.net, i, obs).split(DIM, -1)
+        return mean, log_std.clamp(-20, 2).exp(), None
+    latent = mlp(actor.features, i, obs).relu()
+    variance = (latent[:, :, None] ** 2 * actor.log_std[i].exp() ** 2).sum(1)
+    return mlp(actor.mean, i, latent).clamp(-2, 2), (variance + 1e-6).sqrt(), latent
+
+
+def sampled(agent, actor, i, obs, center, noise):
+    """The suggestion, the action that the critic sees, and its log-density."""
+    mean, std, latent = moments(agent, actor, i, obs)
+    raw = mean + (std * noise if latent is None else latent @ (actor.log_std[i].exp() * noise))
+    normal = Normal(mean, std).log_prob(raw).sum(-1)
+    if agent.mapping == "project":
+        return raw.tanh(), raw.tanh(), normal + 2 * raw.double().cosh().log().sum(-1)
+    if agent.mapping == "alpha":
+        return (
+            raw,
+            CONSTRAINT.alpha_map(obs, raw, center),
+            CONSTRAINT.alpha_log_prob(obs, raw, mean, std, center),
+        )
+    gauge = CONSTRAINT.gauge(obs, raw.double() - center, center)
+    log_det = (DIM - 1) * torch.log(gauge.tanh() / gauge) - 2 * gauge.cosh().log()
+    return raw, CONSTRAINT.radial_map(obs, raw, center), normal - log_det
+
+
+def expected_actor_loss(name, agent, actor, temperature, batch, noise):
+    """The loss of the table in the paper's Section "Algorithms", for each seed the mean over its batch."""
+    losses = []
+    for i in range(len(SEEDS)):
+        obs, center = batch.obs[i], batch.center[i]
+        if name in SAC_NAMES:
+            suggested, action, log_prob = sampled(agent, actor, i, obs, center, noise[i])
+            loss = temperature[i] * log_prob - q_values(agent.critic, i, obs, action).amin(0)
+        elif name == "NFW":
+            suggested, projected = deterministic(agent, actor, i, obs, center)
+            projected = projected.detach().requires_grad_()
+            (gradient,) = torch.autograd.grad(q_values(agent.critic, i, obs, projected)[0].sum(), projected)
+            vertex = CONSTRAINT.linear_oracle(obs, gradient)
+            reference = CONSTRAINT.project(obs, suggested + 0.3 * (vertex - projected)).detach()
+            loss = ((suggested - reference) ** 2).sum(-1)
+        else:
+            suggested, mapped = deterministic(agent, actor, i, obs, center)
+            seen = mapped if name in ("DOpt", "DOpt+", "DAlpha", "DRad") else suggested
+            loss = -q_values(agent.critic, i, obs, seen)[0]
+        if name.endswith("+"):
+            loss = loss + 1.5 * CONSTRAINT.penalty(obs, suggested)
+        losses.append(loss.mean())
+    return torch.stack(losses).sum()
+
+
+@torch.no_grad()
+def expected_targets(name, agent, before, temperature, batch, noise):
+    """r + gamma (1 - terminated) V(s') (seeds, batch), from the networks `before` the step."""
+    rows = []
+    for i in range(len(SEEDS)):
+        obs, center = batch.next_obs[i], batch.next_center[i]
+        if name in SAC_NAMES:
+            _, action, log_prob = sampled(agent, before["actor"], i, obs, center, noise[i])
+            value = -temperature[i] * log_prob
+        else:
+            suggested, mapped = deterministic(agent, before["actor_target"], i, obs, center)
+            action = (suggested if name in ("DPre", "DPre+") else mapped) + noise[i].clamp(-0.6, 0.6)
+            mapped_back = CONSTRAINT.alpha_map(obs, action, center)
+            action = mapped_back if name in ("DAlpha", "DRad") else action.clamp(-1, 1)
+            value = 0.0
+        value = value + q_values(before["critic_target"], i, obs, action).amin(0)
+        rows.append(batch.reward[i] + 0.9 * (1 - batch.terminated[i]) * value)
+    return torch.stack(rows)
+
+
+def draw_noise(agent, stream):
+    """Noise at s and at s' of one update, from a copy of the agent's own stream."""
+    if not agent.config.gsde:
+        both = stream.normal(2, BATCH, DIM)
+        return both[:, 0], both[:, 1]
+    theta = stream.normal(8, DIM)
+    return theta, theta
+
+
+def gradients(module):
+    return {name: parameter.grad for name, parameter in module.named_parameters()}
+
+
+def assert_gradients(module, loss, at):
+    """The gradients left in `module` are those of `loss` with respect to the parameters of `at`, its copy."""
+    expected = torch.autograd.grad(loss, list(at.parameters()))
+    assert sum(float(g.abs().sum()) for g in expected) > 1e-3
+    for (name, found), wanted in zip(gradients(module).items(), expected, strict=True):
+        torch.testing.assert_close(
+            found, wanted.to(found.dtype), rtol=2e-3, atol=2e-5, msg=lambda m, n=name: f"{n}: {m}"
+        )
+
+
+def second_step(name, gsde=False):
+    """The agent after its second update, its networks before that, the batch and the noise it was given."""
+    agent = make_agent(name, gsde)
+    stream = Streams(SEEDS, "update")
+    sac = name in SAC_NAMES
+    agent.update(make_batch(seed=1))
+    draw_noise(agent, stream) if sac else stream.normal(BATCH, DIM)
+    before = {key: deepcopy(module) for key, module in agent.networks().items()}
+    batch = make_batch(seed=2)
+    noise = draw_noise(agent, stream) if sac else (None, stream.normal(BATCH, DIM))
+    agent.update(batch)
+    return agent, before, batch, noise
+
+
+def temperatures(before):
+    return before["temperature"].log_alpha.detach().exp() if "temperature" in before else None
+
+
+@pytest.mark.parametrize("name, gsde", CASES, ids=IDS)
+def test_the_actors_gradient_is_that_of_its_papers_loss(name, gsde):
+    agent, before, batch, (noise, _) = second_step(name, gsde)
+    actor = before["actor"].requires_grad_()
+    assert_gradients(agent.actor, expected_actor_loss(name, agent, actor, temperatures(before), batch, noise), actor)
+
+
+@pytest.mark.parametrize("name, gsde", CASES, ids=IDS)
+def test_the_critics_gradient_is_that_of_the_target(name, gsde):
+    agent, before, batch, (_, noise) = second_step(name, gsde)
+    target = expected_targets(name, agent, before, temperatures(before), batch, noise)
+    critic, loss = before["critic"].requires_grad_(), 0.0
+    for i in range(len(SEEDS)):
+        square = (q_values(critic, i, batch.obs[i], batch.action[i]) - target[i]) ** 2
+        loss = loss + (0.5 if name in SAC_NAMES else 1.0) * square.mean(-1).sum()
+    assert_gradients(agent.critic, loss, critic)
+
+
+@pytest.mark.parametrize("name, gsde", [case for case in CASES if case[0] in SAC_NAMES], ids=IDS[len(TD3_NAMES) :])
+def test_the_temperatures_gradient(name, gsde):
+    agent, before, batch, (noise, _) = second_step(name, gsde)
+    for i in range(len(SEEDS)):
+        log_prob = sampled(agent, before["actor"], i, batch.obs[i], batch.center[i], noise[i])[2].mean()
+        wanted = -(log_prob - DIM)  # the target entropy is -d
+        torch.testing.assert_close(agent.temperature.log_alpha.grad[i, 0], wanted.float(), rtol=1e-3, atol=1e-4)
+
+
+def test_the_batch_leaves_no_case_out():
+    """Suggestions outside the set, noise beyond its clip, actions beyond the box, either critic the smaller one."""
+    batch = make_batch(seed=2)
+    assert (CONSTRAINT.center(batch.obs).abs() > 0.05).any()
+    for name in TD3_NAMES:
+        agent = make_agent(name)
+        suggested = agent.suggest(agent.actor, batch.obs)
+        infeasible = CONSTRAINT.violation(batch.obs, suggested) > 0.05
+        assert infeasible.any() and not infeasible.all()
+        noise = Streams(SEEDS, "update").normal(BATCH, DIM)
+        moved = agent.suggest(agent.actor_target, batch.next_obs) + noise.clamp(-0.6, 0.6)
+        assert (noise.abs() > 0.6).any() and (moved.abs() > 1).any()
+        first, second = agent.critic_target(batch.next_obs, batch.action)
+        assert (first < second).any() and (first > second).any()
+
+
+# ---------------------------------------------------------------- targets, delays, soft updates
+
+
+def constant(net, first, second):
+    """Make the twin critics constant."""
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.zero_()
+        net.net.layers[-1].bias[: len(SEEDS)] = first
+        net.net.layers[-1].bias[len(SEEDS) :] = second
+
+
+@pytest.mark.parametrize("first, second", [(3.0, 5.0), (5.0, 3.0)])
+@pytest.mark.parametrize("name", ["DPre", "DOpt", "DAlpha", "NFW"])
+def test_the_target_of_constant_critics(name, first, second):
+    agent = make_agent(name)
+    constant(agent.critic_target, first, second)
+    batch = make_batch()._replace(reward=torch.full((len(SEEDS), BATCH), 1.0))
+    target = agent.bootstrap(batch)
+    assert batch.terminated.unique().tolist() == [0, 1]
+    torch.testing.assert_close(target, torch.where(batch.terminated == 1, 1.0, 1.0 + 0.9 * 3.0))
+
+
+@pytest.mark.parametrize("name", TD3_NAMES)
+def test_target_actions_are_back_within_bounds(name):
+    agent, batch = make_agent(name, target_noise=5.0, target_noise_clip=4.0), make_batch()
+    action = agent.target_action(batch)
+    if agent.mapping == "project":
+        assert action.abs().max() == 1
+    else:
+        violation = CONSTRAINT.violation(batch.next_obs, action)
+        assert violation.max() <= 1e-6 and (violation > -1e-6).any()
+
+
+def snapshot(module):
+    return [parameter.detach().clone() for parameter in module.parameters()]
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3])
+@pytest.mark.parametrize("name", ["DPre", "DAlpha", "NFW"])
+def test_actor_and_targets_move_every_policy_delay_steps(name, delay):
+    agent = make_agent(name, policy_delay=delay)
+    for number in range(1, 2 * delay + 1):
+        before = {key: snapshot(module) for key, module in agent.networks().items()}
+        agent.update(make_batch(number))
+        for key, module in agent.networks().items():
+            moved = any(not torch.equal(a, b) for a, b in zip(before[key], snapshot(module), strict=True))
+            assert moved == (key == "critic" or number % delay == 0), (key, number)
+
+
+@pytest.mark.parametrize("name", ["DPre", "SAlpha"])
+def test_targets_follow_with_tau(name):
+    agent, before, _, _ = second_step(name)
+    for key in (key for key in agent.networks() if key.endswith("_target")):
+        source = snapshot(agent.networks()[key.removesuffix("_target")])
+        old, new = snapshot(before[key]), snapshot(agent.networks()[key])
+        for o, s, n in zip(old, source, new, strict=True):
+            torch.testing.assert_close(n, 0.9 * o + 0.1 * s)
+    targets = {"TD3": {"actor_target", "critic_target"}, "SAC": {"critic_target"}}[ALGORITHMS[name].base]
+    assert {key for key in agent.networks() if key.endswith("_target")} == targets
+
+
+# ---------------------------------------------------------------- SAC
+
+
+@pytest.mark.parametrize("name", SAC_NAMES)
+def test_the_temperature_rises_for_too_little_entropy_and_falls_for_too_much(name):
+    agent = make_agent(name)
+    with torch.no_grad():
+        for parameter in agent.actor.parameters():
+            parameter.zero_()
+        log_std = agent.actor.net.layers[-1].bias[..., DIM:]
+        log_std[0], log_std[1] = -7.0, -1.0  # entropies of the Gaussian before the map: -11 and 1, the target is -2
+    before = agent.temperature.log_alpha.detach().clone()
+    agent.update(make_batch())
+    change = (agent.temperature.log_alpha - before).squeeze(-1)
+    assert change[0] > 0 > change[1]
+
+
+def test_the_temperature_starts_at_one_for_every_seed():
+    agent = ALGORITHMS["SPre"].agent(
+        make_agent("SPre").config, CONSTRAINT, OBS, SEEDS, mapping="project", placement="environment"
+    )
+    assert torch.equal(agent.temperature.log_alpha, torch.zeros(len(SEEDS), 1))
+
+
+def test_the_variance_of_gsde_is_that_of_its_noise():
+    generator = torch.Generator().manual_seed(0)
+    actor = StateDependentActor(OBS, DIM, [8, 6], [generator])
+    with torch.no_grad():
+        actor.log_std.copy_(torch.randn(actor.log_std.shape, generator=generator))
+        obs = 3 * torch.randn(1, 4, OBS, generator=generator)
+        samples, mean, std = actor.sample(obs, torch.randn(40_000, 6, DIM, generator=generator))
+        latent = mlp(actor.features, 0, obs[0]).relu()
+    assert samples.shape == (40_000, 4, DIM)
+    torch.testing.assert_close(samples.var(0), std[0] ** 2, rtol=0.05, atol=0)
+    torch.testing.assert_close((samples - mean).mean(0) / std[0], torch.zeros(4, DIM), rtol=0, atol=0.03)
+    variance = (latent[:, :, None] ** 2 * actor.log_std[0].exp() ** 2).sum(1)
+    torch.testing.assert_close(std[0] ** 2, variance + 1e-6)
+    # Within one draw of theta the noise of two states is not independent: they share theta.
+    noise = (samples - mean)[:, :2, 0] / std[0, :2, 0]
+    correlation = (latent[0] * latent[1] * actor.log_std[0, :, 0].exp() ** 2).sum() / (std[0, 0, 0] * std[0, 1, 0])
+    torch.testing.assert_close(noise.prod(1).mean(), correlation.detach(), rtol=0, atol=0.03)
+
+
+def test_gsde_starts_small_and_its_mean_is_clipped():
+    actor = StateDependentActor(OBS, DIM, [8, 6], [torch.Generator().manual_seed(0)])
+    assert (actor.log_std == -3).all()
+    with torch.no_grad():
+        actor.mean.layers[-1].bias.copy_(torch.tensor([[9.0, -9.0]]))
+        assert actor(torch.randn(1, 5, OBS))[0].tolist() == [[[2.0, -2.0]] * 5]
+
+
+def test_gsde_keeps_one_theta_for_a_rollout_and_its_seed_alone_changes_it():
+    agent, obs = make_agent("SPre", gsde=True), make_batch().obs[:, 0]
+    agent.start_rollout([0, 1])
+    first = agent.explore(obs, [0, 1])
+    assert torch.equal(agent.explore(obs, [0, 1]), first)
+    agent.start_rollout([1])
+    second = agent.explore(obs, [0, 1])
+    assert torch.equal(second[0], first[0]) and not torch.isclose(second[1], first[1]).any()
+    theta = Streams(SEEDS, "explore").normal(8, DIM)
+    for i in range(len(SEEDS)):
+        mean, _, latent = moments(agent, agent.actor, i, obs[i : i + 1])
+        wanted = (mean + latent @ (agent.actor.log_std[i].exp() * theta[i])).tanh()
+        torch.testing.assert_close(first[i : i + 1], wanted.detach())
+
+
+@pytest.mark.parametrize("mean, std", [(0.0, 0.5), (0.7, 1.0), (-1.0, 0.3)])
+def test_the_density_after_tanh_integrates_to_one(mean, std):
+    agent = make_agent("SPre", constraint=Box(1), seeds=[0])
+    with torch.no_grad():
+        for parameter in agent.actor.parameters():
+            parameter.zero_()
+        agent.actor.net.layers[-1].bias[0, 0] = torch.tensor([mean, std]).clone()
+        agent.actor.net.layers[-1].bias[0, 0, 1] = torch.tensor(std).log()
+        noise = torch.linspace(-6, 6, 4001).view(1, -1, 1)
+        action, log_prob, _ = agent.sample(torch.zeros(1, 4001, OBS), None, noise)
+    mass = torch.trapezoid(log_prob[0].double().exp(), action[0, :, 0].double())
+    assert abs(mass - 1) < 1e-4
+    torch.testing.assert_close(action[0, :, 0], (mean + std * noise[0, :, 0]).tanh())
+
+
+def test_the_density_after_tanh_is_finite_far_out():
+    agent = make_agent("SPre")
+    agent.actor.net.layers[-1].bias.data[..., :DIM] = 40.0
+    action, log_prob, _ = agent.sample(make_batch().obs, None, torch.zeros(len(SEEDS), BATCH, DIM))
+    assert (action == 1).all() and log_prob.isfinite().all() and (log_prob > 50).all()
+
+
+# ---------------------------------------------------------------- acting
+
+
+@pytest.mark.parametrize("name, gsde", CASES, ids=IDS)
+def test_the_policy_of_evaluation_is_the_mapped_mean(name, gsde):
+    agent, obs = make_agent(name, gsde), make_batch().obs
+    streams = [stream.get_state() for s in (agent.exploration, agent.update_noise) for stream in s.generators]
+    act = agent.policy([1])
+    wanted = []
+    for i in range(len(SEEDS)):
+        raw = mlp(agent.actor, i, obs[i]) if name in TD3_NAMES else moments(agent, agent.actor, i, obs[i])[0]
+        mapping = {"project": CONSTRAINT.project, "alpha": CONSTRAINT.alpha_map, "radial": CONSTRAINT.radial_map}
+        wanted.append(mapping[agent.mapping](obs[i], raw.tanh() if agent.mapping == "project" else raw).detach())
+    torch.testing.assert_close(agent.policy([0, 1])(obs), torch.stack(wanted))
+    for _ in range(2):
+        torch.testing.assert_close(act(obs[1:]), wanted[1].unsqueeze(0))
+    # It is a copy, and it draws nothing.
+    for parameter in agent.actor.parameters():
+        parameter.data.add_(1.0)
+    torch.testing.assert_close(act(obs[1:]), wanted[1].unsqueeze(0))
+    after = [stream.get_state() for s in (agent.exploration, agent.update_noise) for stream in s.generators]
+    assert all(torch.equal(a, b) for a, b in zip(streams, after, strict=True))
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_exploration_adds_noise_before_the_map(name):
+    agent, obs = make_agent(name, **({"action_noise": 0.7} if name in TD3_NAMES else {})), make_batch().obs[:, 0]
+    noise = Streams(SEEDS, "explore")
+    for only in ([0, 1], [1], [0, 1]):
+        found, drawn = agent.explore(obs, only), noise.normal(DIM, only=only)
+        for i in only:
+            if name in TD3_NAMES:
+                raw = mlp(agent.actor, i, obs[i : i + 1])[0]
+                wanted = (
+                    (raw.tanh() + 0.7 * drawn[i]).clamp(-1, 1) if agent.mapping == "project" else raw + 0.7 * drawn[i]
+                )
+            else:
+                mean, std, _ = moments(agent, agent.actor, i, obs[i : i + 1])
+                wanted = (mean + std * drawn[i])[0]
+                wanted = wanted.tanh() if agent.mapping == "project" else wanted
+            torch.testing.assert_close(found[i], wanted.detach())
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_executed_and_warm_up_actions_are_feasible(name):
+    """The algorithm's own map makes the executed action; warm-up takes one that leaves feasible actions alone."""
+    agent, obs = make_agent(name), make_batch().obs
+    suggested = 3 * torch.randn(obs.shape[:-1] + (DIM,), generator=torch.Generator().manual_seed(1))
+    mapping = {"project": CONSTRAINT.project, "alpha": CONSTRAINT.alpha_map, "radial": CONSTRAINT.radial_map}
+    assert torch.equal(agent.feasible(obs, suggested, None), mapping[agent.mapping](obs, suggested))
+    pulled = mapping["project" if agent.mapping == "project" else "alpha"](obs, suggested)
+    assert torch.equal(agent.pull_back(obs, suggested, None), pulled)
+    torch.testing.assert_close(agent.pull_back(obs, pulled, None), pulled)
+    warm = torch.stack([agent.warm_up([0, 1]) for _ in range(200)])
+    assert torch.equal(warm[0], Streams(SEEDS, "explore").uniform(DIM))
+    assert (warm.amax((0, 1)) > 0.9).all() and (warm.amin((0, 1)) < -0.9).all() and warm.abs().max() <= 1

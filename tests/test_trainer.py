@@ -1,0 +1,351 @@
+"""The training loop, with a scripted environment and an agent whose only parameter counts its gradient steps."""
+
+from collections.abc import Sequence
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from algos import ALGORITHMS
+from constraints import WeightedPositivePart
+from core.agent import Agent
+from core.config import Config, defaults
+from core.random import Streams
+from core.results import RunWriter, is_finished, read_run
+from core.trainer import Trainer
+
+OBS, DIM = 3, 2
+LENGTHS = (5, 7)  # of every other episode; the shorter ones terminate, the longer ones are cut off
+CONSTRAINT = WeightedPositivePart(lambda obs: obs[..., :DIM] + 1.0, 0.5, DIM)
+
+
+class Scripted(gymnasium.Env):
+    """obs (step, episode, number of the environment) of the episode; the reward is the action's first coordinate."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBS,), np.float64)
+    made = 0
+
+    def __init__(self, fail=None):
+        self.fail = fail  # called before every step
+        self.number, self.episode, self.executed, self.closed = Scripted.made, -1, [], False
+        Scripted.made += 1
+        self.largest_violation = -1.0
+
+    @property
+    def executed_actions(self):
+        return len(self.executed)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.episode += 1
+        self.t = 0
+        return self.obs(), {}
+
+    def obs(self):
+        return np.array([self.t, self.episode % 10, self.number], dtype=np.float64)
+
+    def step(self, action):
+        if self.fail is not None:
+            self.fail(self)
+        self.executed.append(np.array(action))
+        self.t += 1
+        over, short = self.t == LENGTHS[self.episode % 2], self.episode % 2 == 0
+        return self.obs(), float(action[0]), over and short, over and not short, {}
+
+    def close(self):
+        self.closed = True
+
+
+class Counter(Agent):
+    """Its one parameter a seed counts gradient steps; its policy's reward is the score of that number."""
+
+    def __init__(self, config, seeds, scores=()):
+        super().__init__(config, CONSTRAINT, OBS, seeds, mapping="alpha", placement="layer")
+        self.net = nn.Module()
+        self.net.count = nn.Parameter(torch.zeros(len(seeds), 1))
+        self.scores, self.rollouts, self.trainer = scores, [], None
+
+    def networks(self):
+        return {"net": self.net}
+
+    def explore(self, obs, only):
+        return torch.full((len(self.seeds), DIM), 0.01)
+
+    def policy(self, which: Sequence[int]):
+        count = self.net.count.detach()[list(which)].clone()
+
+        def act(obs):
+            reward = torch.tensor([self.scores[int(n)] if self.scores else 0.0 for n in count])
+            return reward.view(-1, 1, 1).expand(*obs.shape[:2], DIM)
+
+        return act
+
+    def update(self, batch):
+        assert batch.obs.shape == (len(self.seeds), self.config.batch_size, OBS)
+        with torch.no_grad():
+            self.net.count += 1
+
+    def start_rollout(self, only):
+        self.rollouts += [(i, self.trainer.steps[i]) for i in only]
+
+
+def make_trainer(tmp_path, seeds=(4,), scores=(), agent=None, fail=None, fail_in_evaluation=None, **settings):
+    settings = {"steps": 50, "learning_starts": 10, "batch_size": 4, "eval_every": 20} | settings
+    settings = {"eval_episodes": 2, "final_episodes": 3} | settings
+    config = Config(algo="Counter", env="Scripted", **settings) if agent is None else agent.config
+    agent = agent or Counter(config, list(seeds), scores)
+    writers = [
+        RunWriter(tmp_path / "Scripted" / "Counter" / f"seed={seed}", {}, {}, config.eval_episodes) for seed in seeds
+    ]
+    trainer = Trainer(
+        config,
+        agent,
+        [Scripted(fail) for _ in seeds],
+        lambda: Scripted(fail_in_evaluation),
+        writers,
+        progress=False,
+    )
+    agent.trainer = trainer
+    return trainer
+
+
+def folder(trainer, i=0):
+    return trainer.writers[i].folder
+
+
+def saved_count(trainer, name, i=0):
+    return float(torch.load(folder(trainer, i) / f"{name}.pt", weights_only=True)["net.count"])
+
+
+def transitions(trainer, i=0):
+    """obs, action, reward, terminated, next_obs, center, next_center of the seed in position i, in order."""
+    replay = trainer.replay
+    rows = replay.rows.view(len(trainer.seeds), replay.capacity, -1)[i, : replay.added[i]]
+    return rows.split(replay.widths, -1)
+
+
+# ---------------------------------------------------------------- evaluations and the best parameters
+
+
+@pytest.mark.parametrize("steps, at", [(50, [20, 40, 50]), (40, [20, 40]), (15, [15])])
+def test_evaluations_every_so_many_steps_and_at_the_end(tmp_path, steps, at):
+    trainer = make_trainer(tmp_path, seeds=(4, 6), steps=steps)
+    trainer.run()
+    for i in range(2):
+        evaluations = read_run(folder(trainer, i)).evaluations
+        assert evaluations.step.tolist() == at and evaluations.returns.shape == (len(at), 2)
+
+
+def scores_at(evaluations):
+    """Scores of the numbers of gradient steps: those given, 0.9 at numbers that no evaluation meets."""
+    return [evaluations.get(n, 0.9) for n in range(60)]
+
+
+@pytest.mark.parametrize(
+    "scores, best_step",
+    [((0.2, 0.4, 0.1), 40), ((0.4, 0.2, 0.1), 20), ((0.1, 0.2, 0.4), 50), ((-0.4, -0.3, -0.4), 40)],
+)
+def test_the_result_is_that_of_the_best_parameters(tmp_path, scores, best_step):
+    # One gradient step after each of the steps 11, 12, ...: evaluations see 9, 29 and 39 of them.
+    counts = dict(zip((20, 40, 50), (9, 29, 39), strict=True))
+    trainer = make_trainer(tmp_path, scores=scores_at(dict(zip(counts.values(), scores, strict=True))))
+    (result,) = trainer.run()
+    evaluations = read_run(folder(trainer)).evaluations
+    # The first two episodes of an environment have 5 and 7 steps; here evaluation uses two environments.
+    means = np.array([evaluations.returns[k] / scores[k] for k in range(3)])
+    assert set(means.round(3).flatten()) <= {5.0, 7.0}
+    assert evaluations.step[evaluations.return_mean.argmax()] == result["best_step"] == best_step
+    assert saved_count(trainer, "best") == counts[best_step] and saved_count(trainer, "last") == 39
+    best = max(scores)
+    per_step = np.array(result["returns"]) / best
+    assert len(result["returns"]) == 3 and set(per_step.round(3)) <= {5.0, 7.0}
+    assert result["return_mean"] == pytest.approx(np.mean(result["returns"]))
+    assert result["gradient_steps"] == 39 and result["steps"] == 50
+    assert read_run(folder(trainer)).result["best_step"] == best_step
+
+
+def test_every_seed_has_a_best_of_its_own(tmp_path):
+    class PerSeed(Counter):
+        def policy(self, which):
+            def act(obs):
+                return torch.stack([torch.full((obs.shape[1], DIM), table[i][int(counts[i])]) for i in which])
+
+            counts = self.net.count.detach().flatten().tolist()
+            table = [scores_at({9: 0.2, 29: 0.4, 39: 0.1}), scores_at({9: 0.3, 29: 0.1, 39: 0.2})]
+            return act
+
+    config = Config("Counter", "Scripted", steps=50, learning_starts=10, batch_size=4, eval_every=20, final_episodes=2)
+    trainer = make_trainer(tmp_path, seeds=(4, 6), agent=PerSeed(config, [4, 6]))
+    results = trainer.run()
+    assert [result["best_step"] for result in results] == [40, 20]
+    assert [saved_count(trainer, "best", i) for i in range(2)] == [29, 9]
+    assert [result["return_mean"] for result in results] == pytest.approx([0.4 * 6, 0.3 * 6], abs=0.8)
+
+
+def test_a_first_evaluation_that_is_nan_does_not_stay_best(tmp_path):
+    trainer = make_trainer(tmp_path, scores=scores_at({9: float("nan"), 29: -0.4, 39: -0.5}))
+    (result,) = trainer.run()
+    assert result["best_step"] == 40 and saved_count(trainer, "best") == 29
+    assert np.isfinite(result["return_mean"])
+
+
+def test_a_later_evaluation_that_is_nan_is_not_best(tmp_path):
+    trainer = make_trainer(tmp_path, scores=scores_at({9: -0.4, 29: float("nan"), 39: -0.5}))
+    (result,) = trainer.run()
+    assert result["best_step"] == 20 and saved_count(trainer, "best") == 9
+
+
+# ---------------------------------------------------------------- rollouts and gradient steps
+
+
+@pytest.mark.parametrize(
+    "train_freq, gradient_steps, learning_starts, wanted",
+    [
+        ("8", 8, 10, 5 * 8),  # after the steps 16, 24, 32, 40, 48
+        ("8", 8, 16, 4 * 8),  # a rollout that ends with the warm-up is still warm-up
+        ("8", 3, 10, 5 * 3),
+        ("8", -1, 10, 5 * 8),
+        ("1", 1, 10, 39),  # after the steps 11 to 49: the run ends with step 50
+        ("1", 2, 0, 49 * 2),
+        ("episode", -1, 10, 7 + 5 + 7 + 5 + 7 + 5 + 7),  # episodes end at 5, 12, 17, 24, 29, 36, 41 and 48
+        ("episode", -1, 12, 5 + 7 + 5 + 7 + 5 + 7),
+        ("episode", 2, 10, 7 * 2),
+        ("1", 1, 50, 0),
+    ],
+)
+def test_the_number_of_gradient_steps(tmp_path, train_freq, gradient_steps, learning_starts, wanted):
+    trainer = make_trainer(
+        tmp_path, train_freq=train_freq, gradient_steps=gradient_steps, learning_starts=learning_starts
+    )
+    (result,) = trainer.run()
+    assert result["gradient_steps"] == saved_count(trainer, "last") == wanted
+
+
+@pytest.mark.parametrize(
+    "train_freq, starts", [("8", [0, 8, 16, 24, 32, 40, 48]), ("episode", [0, 5, 12, 17, 24, 29, 36, 41, 48])]
+)
+def test_the_agent_hears_of_every_rollout(tmp_path, train_freq, starts):
+    trainer = make_trainer(tmp_path, seeds=(4, 6), train_freq=train_freq, gradient_steps=2)
+    trainer.run()
+    for i in range(2):
+        assert [step for j, step in trainer.agent.rollouts if j == i] == starts
+
+
+def test_warm_up_actions_then_exploration(tmp_path):
+    trainer = make_trainer(tmp_path)
+    trainer.run()
+    executed = np.stack(trainer.envs[0].executed)
+    assert executed.shape == (50, DIM)
+    stream = Streams([4], "explore")
+    obs, center = (transitions(trainer)[k] for k in (0, 5))
+    for step in range(10):
+        wanted = CONSTRAINT.alpha_map(obs[step], stream.uniform(DIM)[0], center[step])
+        np.testing.assert_allclose(executed[step], wanted.numpy(), atol=1e-6)
+    np.testing.assert_allclose(executed[10:], 0.01, atol=1e-6)
+
+
+# ---------------------------------------------------------------- what is stored
+
+
+@pytest.mark.parametrize("train_freq", ["1", "episode"])
+def test_stored_transitions(tmp_path, train_freq):
+    trainer = make_trainer(tmp_path, seeds=(4, 6), train_freq=train_freq)
+    trainer.run()
+    for i, env in enumerate(trainer.envs):
+        obs, action, reward, terminated, next_obs, center, next_center = transitions(trainer, i)
+        assert len(obs) == 50
+        wanted, t, episode = [], 0, 0
+        for _ in range(50):
+            over = t + 1 == LENGTHS[episode % 2]
+            # (a time limit is stored as no end)
+            wanted.append([t, episode, env.number, over and episode % 2 == 0, t + 1, episode, env.number])
+            t, episode = (0, episode + 1) if over else (t + 1, episode)
+        assert torch.equal(torch.cat([obs, terminated, next_obs], -1), torch.tensor(wanted).float())
+        assert torch.equal(action, torch.from_numpy(np.stack(env.executed)))
+        assert torch.equal(reward[:, 0], action[:, 0])
+        # The centre of s' belongs to where the episode ended, not to where the next one starts.
+        torch.testing.assert_close(center, CONSTRAINT.center(obs), rtol=0, atol=1e-6)
+        torch.testing.assert_close(next_center, CONSTRAINT.center(next_obs), rtol=0, atol=1e-6)
+        assert not torch.equal(center[1:], next_center[:-1])
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_the_buffer_has_suggestions_where_the_environment_maps_and_executed_actions_elsewhere(tmp_path, name):
+    algorithm = ALGORITHMS[name]
+    config = defaults(name, "Scripted", "Hopper", algorithm.base, name == "NFW", algorithm.penalty, steps=40)
+    config.hidden, config.learning_starts, config.batch_size, config.eval_every = [8, 8], 20, 4, 40
+    config.eval_episodes = config.final_episodes = 1
+    if config.action_noise:
+        config.action_noise = 1.0
+    agent = algorithm.agent(config, CONSTRAINT, OBS, [4], mapping=algorithm.mapping, placement=algorithm.placement)
+    trainer = make_trainer(tmp_path, agent=agent)
+    trainer.run()
+    obs, stored, *_ = transitions(trainer)
+    executed = torch.from_numpy(np.stack(trainer.envs[0].executed))
+    assert CONSTRAINT.violation(obs, executed).max() <= 1e-6
+    if name in ("DPre", "DPre+", "SPre", "SPre+"):
+        for part in (slice(0, 20), slice(20, 40)):  # warm-up, training
+            assert (CONSTRAINT.violation(obs[part], stored[part]) > 0.01).any()
+        torch.testing.assert_close(CONSTRAINT.project(obs, stored), executed)
+    else:
+        assert torch.equal(stored, executed)
+
+
+# ---------------------------------------------------------------- early ends
+
+
+class BrokenError(Exception):
+    pass
+
+
+def test_an_exception_saves_the_parameters_and_closes_everything(tmp_path):
+    def fail(env):
+        if env.executed_actions == 30:
+            raise BrokenError
+
+    trainer = make_trainer(tmp_path, seeds=(4, 6), fail=fail)
+    with pytest.raises(BrokenError):
+        trainer.run()
+    for i in range(2):
+        assert saved_count(trainer, "last", i) == 20  # after the steps 11 to 30
+        assert saved_count(trainer, "best", i) == 9
+        assert not is_finished(folder(trainer, i)) and read_run(folder(trainer, i)).evaluations.step.tolist() == [20]
+    assert all(env.closed for env in trainer.envs)
+    assert all(env.closed for i in range(2) for env in trainer.evaluator.of_seed(i))
+
+
+def test_an_interrupt_during_the_final_evaluation_keeps_the_last_parameters(tmp_path):
+    def fail(env):
+        if env.episode > 3:  # three evaluations are episodes 1 to 3 of each environment
+            raise KeyboardInterrupt
+
+    scores = scores_at({9: 0.4, 29: 0.2, 39: 0.1})
+    trainer = make_trainer(tmp_path, scores=scores, fail_in_evaluation=fail)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    assert read_run(folder(trainer)).evaluations.step.tolist() == [20, 40, 50]
+    assert saved_count(trainer, "last") == 39 and saved_count(trainer, "best") == 9
+    assert not is_finished(folder(trainer))
+
+
+def test_a_failure_leaves_finished_seeds_as_they_are(tmp_path):
+    def fail(env):
+        if env is trainer.envs[0] and env.executed_actions == 41:
+            raise BrokenError
+
+    trainer = make_trainer(tmp_path, seeds=(4, 6), fail=fail, steps=42, train_freq="episode", gradient_steps=-1)
+    # The second seed's first episode has 7 steps: its last one ends after the run, at 43, the first one's at 41.
+    trainer.envs[1].episode = 0
+    with pytest.raises(BrokenError):
+        trainer.run()
+    assert not is_finished(folder(trainer, 0)) and saved_count(trainer, "last", 0) == 7 + 5 + 7 + 5 + 7 + 5
+    assert is_finished(folder(trainer, 1)) and saved_count(trainer, "last", 1) == 5 + 7 + 5 + 7 + 5
+
+
+def test_counts_of_the_result(tmp_path):
+    (result,) = make_trainer(tmp_path, eval_episodes=2, final_episodes=2).run()
+    # Three evaluations and the final one in two environments; each alternates episodes of 7 and 5 steps.
+    assert result["executed_actions"] == 50 + 2 * (7 + 5 + 7 + 5)
+    assert result["largest_violation"] == -1.0 and result["seeds_in_lockstep"] == 1

@@ -78,8 +78,8 @@ def project_on_rows(
             first = int((stuck & (over > _EMPTY)).nonzero()[0])
             # The row that cannot be met or one of those in its way, the box's aside.
             conflict = [row for row in [int(entering[first]), *index[first].tolist()] if 0 <= row < named]
-            where = f", row {conflict[0]}" if conflict else ""
-            raise ConstraintError(f"{name(int(sample[first]))}{where}: the set is empty")
+            which = f", row {conflict[0]}" if conflict else ""
+            raise ConstraintError(f"{name(int(sample[first]))}{which}: the set is empty")
         # A dependent row that the active ones meet up to rounding is met.
         limits[stuck.nonzero().squeeze(-1), entering[stuck]] += over[stuck].clamp(min=0.0) + tolerance[stuck]
 

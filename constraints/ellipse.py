@@ -183,7 +183,7 @@ class PlanarEllipse(Constraint):
         )
 
 
-def ellipse_excess(value: Tensor, trace: Tensor, bound: float, dim: int) -> Tensor:
+def ellipse_excess(value: Tensor, trace: Tensor, bound: Tensor | float, dim: int) -> Tensor:
     """sqrt(a'Qa) - sqrt(bound) (...) with Q and bound scaled so that tr Q = dim; a zero Q stays as it is.
 
     value (...) = a'Qa and trace (...) = tr Q before scaling.
@@ -194,7 +194,7 @@ def ellipse_excess(value: Tensor, trace: Tensor, bound: float, dim: int) -> Tens
 
 
 def ellipse_gauge_gradient(
-    direction: Tensor, bent_direction: Tensor, center: Tensor | None, bent_center: Tensor | None, bound: float
+    direction: Tensor, bent_direction: Tensor, center: Tensor | None, bent_center: Tensor | None, bound: Tensor | float
 ) -> Tensor:
     """Gradient (..., d) of the gauge of a'Qa <= bound around `center` (None: the origin); `bent_x` is Qx.
 

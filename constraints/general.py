@@ -62,8 +62,14 @@ class _Sets:
 
     def __getitem__(self, index: Tensor) -> _Sets:
         positions = index.tolist()
-        parts = (part[index] for part in (self.rows, self.bounds, self.matrix, self.center, self.root))
-        return _Sets(*parts, name=lambda i: self.name(positions[i]))
+        return _Sets(
+            self.rows[index],
+            self.bounds[index],
+            self.matrix[index],
+            self.center[index],
+            self.root[index],
+            lambda i: self.name(positions[i]),
+        )
 
     def ellipse_values(self, point: Tensor) -> tuple[Tensor, Tensor]:
         """Values (n, k) of the ellipses at the point (n, d), inside where <= 1, and their gradients (n, k, d)."""

@@ -51,6 +51,10 @@ class QuadraticConstraint(GeneralConstraint):
         return obs.new_zeros(self.dim) if self._c is None else self._c(obs)
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
+        return obs.new_zeros(0, self.dim), obs.new_zeros(0), [self._ellipse(obs)]
+
+    def _ellipse(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Q, c and the bound, checked."""
         check_obs(obs)
         matrix = checked(self.Q(obs), "Q(obs)", (self.dim, self.dim), obs)
         center = checked(self.c(obs), "c(obs)", (self.dim,), obs)
@@ -62,10 +66,10 @@ class QuadraticConstraint(GeneralConstraint):
         least = torch.linalg.eigvalsh(matrix)[..., 0]
         require((least >= -1e-9 * largest).flatten(), "Q(obs) is not positive semi-definite", name)
         require((bound > 0.0).flatten(), "bound(obs) is not positive", name_samples(tuple(bound.shape)))
-        return obs.new_zeros(0, self.dim), obs.new_zeros(0), [(matrix, center, bound)]
+        return matrix, center, bound
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        _, _, [(matrix, center, bound)] = self.explicit(obs)
+        matrix, center, bound = self._ellipse(obs)
         offset = action - center
         value = (offset * (matrix @ offset.unsqueeze(-1)).squeeze(-1)).sum(-1)
         return ellipse_excess(value, matrix.diagonal(dim1=-2, dim2=-1).sum(-1), bound, self.dim)
@@ -74,7 +78,7 @@ class QuadraticConstraint(GeneralConstraint):
         return self._violation(obs, action).clamp(min=0.0)
 
     def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        _, _, [(matrix, middle, bound)] = self.explicit(obs)
+        matrix, middle, bound = self._ellipse(obs)
         offset = (-middle if center is None else center - middle).expand_as(direction)
         bent = (matrix @ offset.unsqueeze(-1)).squeeze(-1)
         inside = (bent * offset).sum(-1) < bound * (1.0 - ON_BOUNDARY)

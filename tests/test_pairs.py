@@ -26,8 +26,16 @@ def settings(algo, task):
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_pair(tmp_path, capsys, algo, task):
-    chosen = settings(algo, task)
+def test_pair(tmp_path, capsys, monkeypatch, algo, task):
+    chosen, fresh = settings(algo, task), {}
+
+    def make_trainer(*arguments):
+        trainer = original(*arguments)
+        fresh.update(trainer.agent.state(0))
+        return trainer
+
+    original = run.make_trainer
+    monkeypatch.setattr(run, "make_trainer", make_trainer)
     words = [f"algo={algo}", f"env={task}", "seed=0", f"results={tmp_path}", *(f"{k}={v}" for k, v in chosen.items())]
     assert run.main([*words, *SHORT]) == 0
     (folder,) = tmp_path.glob("*/*/seed=0")
@@ -39,8 +47,17 @@ def test_pair(tmp_path, capsys, algo, task):
 
     last = torch.load(folder / "last.pt", weights_only=True)
     assert all(parameter.isfinite().all() for parameter in last.values())
-    target = {name: p for name, p in last.items() if name.startswith("critic_target")}
-    assert any(not torch.equal(p, last[name.replace("_target", "")]) for name, p in target.items())
+    assert last.keys() == fresh.keys()
+    modules = {name.split(".")[0] for name in last}
+    assert {"actor", "critic", "critic_target"} <= modules and ("actor_target" in modules) == (
+        ALGORITHMS[algo].base == "TD3"
+    )
+    for module in modules:
+        names = [name for name in last if name.startswith(f"{module}.")]
+        assert any(not torch.equal(last[name], fresh[name]) for name in names), f"{module} has not moved"
+        if module.endswith("_target"):
+            sources = {name: name.replace("_target", "", 1) for name in names}
+            assert any(not torch.equal(last[name], last[source]) for name, source in sources.items()), module
 
 
 def test_every_executed_action_is_counted(tmp_path):

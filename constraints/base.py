@@ -9,6 +9,7 @@ action: the cost at these sizes is the number of operations, not their width.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch
@@ -27,7 +28,7 @@ ExplicitSet = tuple[Tensor, Tensor, list[tuple[Tensor, Tensor, Tensor | float]]]
 (a - c)' Q (a - c) <= bound, the box left out."""
 
 
-class Constraint:
+class Constraint(ABC):
     """A feasible set A(obs) inside the box [-1, 1]^dim.
 
     A subclass implements the protected methods. They receive float64 tensors, `action` (or `direction`, `gradient`)
@@ -44,29 +45,29 @@ class Constraint:
 
     # ---------------------------------------------------------------- what a subclass gives
 
+    @abstractmethod
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         """Excess (...) over the constraint, the box left out."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         """The paper's penalty (...), with finite gradients everywhere."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         """Closest feasible point (..., d) and the product with the projection's Jacobian there."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         """Gauge (...) of the whole set, box included, and its gradient (..., d) with respect to `direction`.
 
         Both are differentiable in `direction`, finite also at 0, where they are 0. `direction` has largest entry 1
         unless it is 0; `center` is None for the origin.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         """Feasible point (..., d) with the largest inner product with `gradient`."""
-        raise NotImplementedError
 
     def _center(self, obs: Tensor) -> Tensor:
         """Interior point (..., d) or one (d,) for every obs."""
@@ -74,7 +75,7 @@ class Constraint:
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         """The set written out in rows and ellipses, as a part of an `Intersection` must be."""
-        raise NotImplementedError(f"{type(self).__name__} does not write out its rows and ellipses")
+        raise TypeError(f"{type(self).__name__} does not write out its rows and ellipses")
 
     # ---------------------------------------------------------------- the interface
 

@@ -13,6 +13,7 @@ All of it runs on the CPU in float64, wherever the tensors are.
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,9 +94,9 @@ class GeneralConstraint(Constraint):
 
     origin_centered = False
 
+    @abstractmethod
     def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         """Gradients (..., d) of the gauges of the parts, the box left out."""
-        raise NotImplementedError
 
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         if center is not None:

@@ -32,13 +32,13 @@ class LinearConstraint(GeneralConstraint):
     def A(self, obs: Tensor) -> Tensor:
         """Rows (..., m, d) at obs (..., n), which is float64; they are scaled to unit norm where that matters."""
         if self._A is None:
-            raise NotImplementedError(f"{type(self).__name__} needs A(obs)")
+            raise TypeError(f"{type(self).__name__} needs A(obs)")
         return self._A(obs)
 
     def b(self, obs: Tensor) -> Tensor:
         """Bounds (..., m) of the rows at obs (..., n)."""
         if self._b is None:
-            raise NotImplementedError(f"{type(self).__name__} needs b(obs)")
+            raise TypeError(f"{type(self).__name__} needs b(obs)")
         return self._b(obs)
 
     def explicit(self, obs: Tensor) -> ExplicitSet:

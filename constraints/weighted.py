@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from abc import abstractmethod
 
 import torch
 from torch import Tensor
@@ -35,13 +36,13 @@ class _WeightPatterns(Constraint):
         self.weight = weight
         self.bound = bound
 
+    @abstractmethod
     def _patterns(self, device: torch.device) -> Tensor:
         """The rows' patterns (m, d), entries in {-1, 0, 1}."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
         """The row (..., d) with the largest value in the orthant `side` (..., d), entries in {-1, 0, 1}."""
-        raise NotImplementedError
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         rows = self.weight(obs).unsqueeze(-2) * self._patterns(obs.device)

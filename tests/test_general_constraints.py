@@ -475,11 +475,11 @@ def test_misuse():
         Intersection()
     with pytest.raises(ValueError, match="different dimensions"):
         Intersection(Box(2), Box(3))
-    with pytest.raises(NotImplementedError, match=r"LinearConstraint needs A\(obs\)"):
+    with pytest.raises(TypeError, match=r"LinearConstraint needs A\(obs\)"):
         LinearConstraint(2).project(no_obs(1), NO_CENTER)
 
     class Unwritten(Box):
         explicit = Constraint.explicit
 
-    with pytest.raises(NotImplementedError, match="Unwritten"):
+    with pytest.raises(TypeError, match="Unwritten"):
         Intersection(Unwritten(2)).project(no_obs(1), NO_CENTER)

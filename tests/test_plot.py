@@ -366,9 +366,7 @@ def test_reward_records(mixed):
 def test_markdown(mixed):
     root, _ = mixed
     text = (root / "tables" / "rewards.md").read_text()
-    rows = [
-        [cell.strip() for cell in line.strip("|\n").split("|")] for line in text.splitlines() if "|" in line
-    ]
+    rows = [[cell.strip() for cell in line.strip("|\n").split("|")] for line in text.splitlines() if "|" in line]
     assert rows[0] == ["Condition", *plot.COLORS, "Mine"]
     row = dict(zip(rows[0], rows[3], strict=True))
     assert [r[0] for r in rows[2:]] == ["R+N", "R+L2", "W+M", "W+M batch_size=16"]

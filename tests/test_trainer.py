@@ -145,7 +145,13 @@ def scores_at(evaluations):
 
 @pytest.mark.parametrize(
     "scores, best_step",
-    [((0.2, 0.4, 0.1), 40), ((0.4, 0.2, 0.1), 20), ((0.1, 0.2, 0.4), 50), ((-0.4, -0.3, -0.4), 40), ((0.4, 0.2, 0.4), 20)],
+    [
+        ((0.2, 0.4, 0.1), 40),
+        ((0.4, 0.2, 0.1), 20),
+        ((0.1, 0.2, 0.4), 50),
+        ((-0.4, -0.3, -0.4), 40),
+        ((0.4, 0.2, 0.4), 20),
+    ],
 )
 def test_the_result_is_that_of_the_best_parameters(tmp_path, scores, best_step):
     # One gradient step after each of the steps 11, 12, ...: evaluations see 9, 29 and 39 of them.

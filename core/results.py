@@ -31,7 +31,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import yaml
 
-_PACKAGES = ("torch", "numpy", "scipy", "gymnasium", "mujoco", "pybullet", "osqp", "omegaconf")
+_PACKAGES = ("torch", "numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omegaconf")
 # libyaml's loader is some ten times faster, which counts with two thousand runs; not every wheel has it.
 _YamlLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 

@@ -67,6 +67,11 @@ def make_batch(seed=0):
 # ---------------------------------------------------------------- the formulas, for one seed: obs (batch, n)
 
 
+def map_of(agent):
+    """The map of the paper's name, "project" for most."""
+    return {"DAlpha": "alpha", "SAlpha": "alpha", "DRad": "radial", "SRad": "radial"}.get(agent.config.algo, "project")
+
+
 def mlp(net, row, x):
     """The network of one row, layer by layer."""
     for number, layer in enumerate(net.layers):
@@ -83,9 +88,9 @@ def q_values(critic, i, obs, action):
 def deterministic(agent, actor, i, obs, center):
     """A TD3 actor's suggestion and what its map makes of it."""
     raw = mlp(actor, i, obs)
-    if agent.mapping == "project":
+    if map_of(agent) == "project":
         return raw.tanh(), CONSTRAINT.project(obs, raw.tanh())
-    return raw, (CONSTRAINT.alpha_map if agent.mapping == "alpha" else CONSTRAINT.radial_map)(obs, raw, center)
+    return raw, (CONSTRAINT.alpha_map if map_of(agent) == "alpha" else CONSTRAINT.radial_map)(obs, raw, center)
 
 
 def moments(agent, actor, i, obs):
@@ -103,9 +108,9 @@ def sampled(agent, actor, i, obs, center, noise):
     mean, std, latent = moments(agent, actor, i, obs)
     raw = mean + (std * noise if latent is None else latent @ (actor.log_std[i].exp() * noise))
     normal = Normal(mean, std).log_prob(raw).sum(-1)
-    if agent.mapping == "project":
+    if map_of(agent) == "project":
         return raw.tanh(), raw.tanh(), normal + 2 * raw.double().cosh().log().sum(-1)
-    if agent.mapping == "alpha":
+    if map_of(agent) == "alpha":
         return (
             raw,
             CONSTRAINT.alpha_map(obs, raw, center),
@@ -272,7 +277,7 @@ def test_the_target_of_constant_critics(name, first, second):
 def test_target_actions_are_back_within_bounds(name):
     agent, batch = make_agent(name, target_noise=5.0, target_noise_clip=4.0), make_batch()
     action = agent.target_action(batch)
-    if agent.mapping == "project":
+    if map_of(agent) == "project":
         assert action.abs().max() == 1
     else:
         violation = CONSTRAINT.violation(batch.next_obs, action)
@@ -407,7 +412,7 @@ def test_the_policy_of_evaluation_is_the_mapped_mean(name, gsde):
     for i in range(len(SEEDS)):
         raw = mlp(agent.actor, i, obs[i]) if name in TD3_NAMES else moments(agent, agent.actor, i, obs[i])[0]
         mapping = {"project": CONSTRAINT.project, "alpha": CONSTRAINT.alpha_map, "radial": CONSTRAINT.radial_map}
-        wanted.append(mapping[agent.mapping](obs[i], raw.tanh() if agent.mapping == "project" else raw).detach())
+        wanted.append(mapping[map_of(agent)](obs[i], raw.tanh() if map_of(agent) == "project" else raw).detach())
     torch.testing.assert_close(agent.policy([0, 1])(obs), torch.stack(wanted))
     for _ in range(2):
         torch.testing.assert_close(act(obs[1:]), wanted[1].unsqueeze(0))
@@ -429,12 +434,12 @@ def test_exploration_adds_noise_before_the_map(name):
             if name in TD3_NAMES:
                 raw = mlp(agent.actor, i, obs[i : i + 1])[0]
                 wanted = (
-                    (raw.tanh() + 0.7 * drawn[i]).clamp(-1, 1) if agent.mapping == "project" else raw + 0.7 * drawn[i]
+                    (raw.tanh() + 0.7 * drawn[i]).clamp(-1, 1) if map_of(agent) == "project" else raw + 0.7 * drawn[i]
                 )
             else:
                 mean, std, _ = moments(agent, agent.actor, i, obs[i : i + 1])
                 wanted = (mean + std * drawn[i])[0]
-                wanted = wanted.tanh() if agent.mapping == "project" else wanted
+                wanted = wanted.tanh() if map_of(agent) == "project" else wanted
             torch.testing.assert_close(found[i], wanted.detach())
 
 
@@ -444,8 +449,8 @@ def test_executed_and_warm_up_actions_are_feasible(name):
     agent, obs = make_agent(name), make_batch().obs
     suggested = 3 * torch.randn(obs.shape[:-1] + (DIM,), generator=torch.Generator().manual_seed(1))
     mapping = {"project": CONSTRAINT.project, "alpha": CONSTRAINT.alpha_map, "radial": CONSTRAINT.radial_map}
-    assert torch.equal(agent.feasible(obs, suggested, None), mapping[agent.mapping](obs, suggested))
-    pulled = mapping["project" if agent.mapping == "project" else "alpha"](obs, suggested)
+    assert torch.equal(agent.feasible(obs, suggested, None), mapping[map_of(agent)](obs, suggested))
+    pulled = mapping["project" if map_of(agent) == "project" else "alpha"](obs, suggested)
     assert torch.equal(agent.pull_back(obs, suggested, None), pulled)
     torch.testing.assert_close(agent.pull_back(obs, pulled, None), pulled)
     warm = torch.stack([agent.warm_up([0, 1]) for _ in range(200)])

@@ -174,19 +174,22 @@ def test_the_result_is_that_of_the_best_parameters(tmp_path, scores, best_step):
 
 def test_every_seed_has_a_best_of_its_own(tmp_path):
     class PerSeed(Counter):
-        def policy(self, which):
-            def act(obs):
-                return torch.stack([torch.full((obs.shape[1], DIM), table[i][int(counts[i])]) for i in which])
+        def __init__(self, config, seeds):
+            super().__init__(config, seeds)
+            self.net.count.data[1] = 100.0  # where the second seed's number of gradient steps starts
 
+        def policy(self, which):
             counts = self.net.count.detach().flatten().tolist()
-            table = [scores_at({9: 0.2, 29: 0.4, 39: 0.1}), scores_at({9: 0.3, 29: 0.1, 39: 0.2})]
-            return act
+            tables = [scores_at({9: 0.2, 29: 0.4, 39: 0.1}), scores_at({9: 0.3, 29: 0.1, 39: 0.2})]
+            scores = [tables[i][int(counts[i]) - 100 * i] for i in which]
+            return lambda obs: torch.tensor(scores).view(-1, 1, 1).expand(*obs.shape[:2], DIM)
 
     config = Config("Counter", "Scripted", steps=50, learning_starts=10, batch_size=4, eval_every=20, final_episodes=2)
     trainer = make_trainer(tmp_path, seeds=(4, 6), agent=PerSeed(config, [4, 6]))
     results = trainer.run()
     assert [result["best_step"] for result in results] == [40, 20]
-    assert [saved_count(trainer, "best", i) for i in range(2)] == [29, 9]
+    assert [saved_count(trainer, "best", i) for i in range(2)] == [29, 109]
+    assert [saved_count(trainer, "last", i) for i in range(2)] == [39, 139]
     assert [result["return_mean"] for result in results] == pytest.approx([0.4 * 6, 0.3 * 6], abs=0.8)
 
 

@@ -161,6 +161,8 @@ def test_an_interrupt_leaves_a_usable_state(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "run.py", *words, f"results={tmp_path}"],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        # Whoever runs the tests in the background may have them ignore the signal, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     deadline = time.monotonic() + 60
     while not list(tmp_path.glob("*/*/seed=0/best.pt")) and time.monotonic() < deadline:

@@ -296,20 +296,6 @@ def test_radial_log_prob_is_the_jacobian_s_determinant(task):
             torch.testing.assert_close(got[k], expected, rtol=1e-7, atol=1e-7)
 
 
-@every_task
-def test_samples_are_the_maps_and_their_densities(task):
-    constraint, obs, action = task.constraint, sample_obs(task, 40, 10).float(), sample_action(task, 40, 10).float()
-    mean, std, log_prob = torch.zeros_like(action), torch.full_like(action, 0.5), action.sum(-1)
-    center = interior_point(task, obs.double(), 11).float()
-    for c in (None, center):
-        mapped, density = constraint.alpha_sample(obs, action, mean, std, c)
-        assert torch.equal(mapped, constraint.alpha_map(obs, action, c))
-        assert torch.equal(density, constraint.alpha_log_prob(obs, action, mean, std, c))
-        mapped, density = constraint.radial_sample(obs, action, log_prob, c)
-        assert torch.equal(mapped, constraint.radial_map(obs, action, c))
-        assert torch.equal(density, constraint.radial_log_prob(obs, action, log_prob, c))
-
-
 @pytest.mark.parametrize("name", ["R+N", "R+L2", "R+O10", "R+M", "R+T"])
 def test_alpha_log_prob_has_mass_one(name):
     constraint = TASKS[name].constraint

@@ -104,6 +104,7 @@ class SAC(Agent):
         self.temperature_optimizer = adam(self.temperature.parameters(), config.learning_rate)
         self.target_entropy = -float(self.action_dim)
         self.rollout_noise = torch.zeros(len(seeds), *self.actor.noise_shape)
+        self.entropy: Tensor | None = None  # of the policy at the last batch's states
 
     def networks(self) -> dict[str, nn.Module]:
         return {
@@ -163,7 +164,8 @@ class SAC(Agent):
         action, log_prob, suggested = self.sample(batch.obs, batch.center, noise)
 
         alpha = self.temperature.log_alpha.detach().exp()
-        surplus = (log_prob.detach() + self.target_entropy).mean(-1, keepdim=True)
+        self.entropy = -log_prob.detach().mean(-1, keepdim=True)
+        surplus = self.target_entropy - self.entropy
         descend(self.temperature_optimizer, -(self.temperature.log_alpha * surplus).sum())
 
         with torch.no_grad():
@@ -176,6 +178,11 @@ class SAC(Agent):
         value = self.critic(batch.obs, action).amin(0) - alpha * log_prob
         descend(self.actor_optimizer, (self.penalty(batch.obs, suggested) - value).mean(-1).sum())
         soft_update(self.critic_target, self.critic, self.config.tau)
+
+    def statistics(self) -> dict[str, Tensor]:
+        if self.entropy is None:
+            return {}
+        return {"temperature": self.temperature.log_alpha.detach().exp()[:, 0], "entropy": self.entropy[:, 0]}
 
     def draw_noise(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Noise for the samples at s and at s': with gSDE one theta serves both, for the whole batch."""

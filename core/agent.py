@@ -96,6 +96,10 @@ class Agent(ABC):
     def update(self, batch: Batch) -> None:
         """One gradient step of every seed."""
 
+    def statistics(self) -> dict[str, Tensor]:
+        """What the last gradient step tells about the state of training: name -> (seeds,). Empty before the first."""
+        return {}
+
     @torch.no_grad()
     def state(self, i: int) -> dict[str, Tensor]:
         """A copy of the parameters of the seed in position i."""

@@ -4,6 +4,7 @@
         config.yaml      the resolved configuration
         info.json        versions, git commit, command line, start time
         evaluations.csv  step,return_mean,return_1,...,return_k,seconds: one row an evaluation, appended
+        training.csv     step and the algorithm's own measures (SAC: temperature, entropy), from the first update on
         best.pt last.pt  state dicts
         result.json      the final evaluation; written last, so its presence means that the run is finished
 
@@ -132,8 +133,17 @@ class RunWriter:
         if values.shape != (self.eval_episodes,):
             raise ValueError(f"an evaluation has {self.eval_episodes} returns, got shape {values.shape}")
         row = [str(int(step)), *(repr(float(x)) for x in (values.mean(), *values)), f"{seconds:.2f}"]
+        self._append("evaluations.csv", row)
+
+    def append_statistics(self, step: int, values: Mapping[str, float]) -> None:
+        """Append the algorithm's measures at environment step `step`; their names are the same at every call."""
+        if not (self.folder / "training.csv").exists():
+            self._append("training.csv", ["step", *values])
+        self._append("training.csv", [str(int(step)), *(repr(float(value)) for value in values.values())])
+
+    def _append(self, name: str, row: Sequence[str]) -> None:
         # One write of one line: a reader meanwhile sees it whole, or without its line end.
-        with open(self.folder / "evaluations.csv", "a") as file:
+        with open(self.folder / name, "a") as file:
             file.write(",".join(row) + "\n")
 
     def save_parameters(self, name: str, state_dict: Mapping[str, Any]) -> None:

@@ -185,8 +185,13 @@ class Trainer:
     def _evaluate(self, which: Sequence[int]) -> None:
         with self._timed("evaluation"):
             returns = self.evaluator.run(self.agent.policy(which), which, self.config.eval_episodes)
+        statistics = self.agent.statistics()
         for i, seed_returns in zip(which, returns, strict=True):
             self.writers[i].append_evaluation(self.steps[i], seed_returns, time.perf_counter() - self.started)
+            if statistics and self.gradient_steps[i]:
+                self.writers[i].append_statistics(
+                    self.steps[i], {name: float(values[i]) for name, values in statistics.items()}
+                )
             mean = float(seed_returns.mean())
             if self.best[i] is None or mean > self.best[i][0] or math.isnan(self.best[i][0]):
                 self.best[i] = mean, self.steps[i], self.agent.state(i)

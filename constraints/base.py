@@ -8,14 +8,14 @@ action: the cost at these sizes is the number of operations, not their width.
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from constraints.density import alpha_boundary_log_density, radial_log_det
+from constraints.density import refuse_second_derivatives
+from constraints.ray import Ray, differentiable_gauge
 
 Coefficients = Callable[[Tensor], Tensor]
 """Maps observations (..., n) to a constraint's state-dependent coefficients (..., d) or (..., d, d)."""
@@ -61,8 +61,8 @@ class Constraint(ABC):
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         """Gauge (...) of the whole set, box included, and its gradient (..., d) with respect to `direction`.
 
-        Both are differentiable in `direction`, finite also at 0, where they are 0. `direction` has largest entry 1
-        unless it is 0; `center` is None for the origin.
+        The gradient is differentiable in `direction`, the gauge need not be. Both are 0 where `direction` is;
+        `center` is None for the origin.
         """
 
     @abstractmethod
@@ -119,28 +119,35 @@ class Constraint(ABC):
         """
         obs64, direction64 = self._broadcast(obs, direction)
         center64 = None if center is None else center.detach().double()
-        return self._gauge64(obs64, direction64, center64)[0].to(direction.dtype)
+        # L is homogeneous: scaled to length 1, squares of even the tiniest direction stay above zero.
+        largest = direction64.detach().abs().amax(-1)
+        size = torch.where(largest > 0.0, largest, 1.0)
+        gauge, gradient = self._gauge_and_gradient(obs64, direction64.detach() / size.unsqueeze(-1), center64)
+        return differentiable_gauge(direction64, gauge * size, gradient).to(direction.dtype)
+
+    def ray(self, obs: Tensor, action: Tensor, center: Tensor | None = None) -> Ray:
+        """The ray from the centre through `action`: one evaluation of the gauge that serves a map and its density.
+
+        Actions are at most 1e150 long; beyond, a map may return NaN.
+        """
+        obs64, action64 = self._broadcast(obs, action)
+        if center is None and not self.origin_centered:
+            center = self.center(obs64)
+        center64 = None if center is None else center.detach().double()
+        offset = action64 if center64 is None else action64 - center64
+        return Ray(action, center64, offset, *self._gauge_and_gradient(obs64, offset, center64))
 
     def alpha_map(self, obs: Tensor, action: Tensor, center: Tensor | None = None) -> Tensor:
         """alpha-projection: the feasible point (..., d) closest to `action` on its ray from the centre."""
-        offset, center64, gauge, _ = self._ray(obs, action, center)
-        mapped = offset / gauge.clamp(min=1.0).unsqueeze(-1)
-        return (mapped if center64 is None else center64 + mapped).to(action.dtype)
+        return self.ray(obs, action, center).alpha_map()
 
     def radial_map(self, obs: Tensor, action: Tensor, center: Tensor | None = None) -> Tensor:
         """Radial squashing c + tanh(L)/L (action - c) (..., d) (paper, Eq. radial squashing); smooth at c."""
-        offset, center64, gauge, _ = self._ray(obs, action, center)
-        # Below 1e-3 the series is exact to rounding, and division by zero is avoided at the centre.
-        near = gauge < 1e-3
-        safe = torch.where(near, 1.0, gauge)
-        factor = torch.where(near, 1.0 - gauge**2 / 3.0 + 2.0 / 15.0 * gauge**4, torch.tanh(safe) / safe)
-        mapped = factor.unsqueeze(-1) * offset
-        return (mapped if center64 is None else center64 + mapped).to(action.dtype)
+        return self.ray(obs, action, center).radial_map()
 
     def radial_log_prob(self, obs: Tensor, action: Tensor, log_prob: Tensor, center: Tensor | None = None) -> Tensor:
         """Log-density (...) of `radial_map(obs, action)`, given the log-density `log_prob` (...) of `action`."""
-        gauge = self._ray(obs, action, center)[2]
-        return (log_prob.double() - radial_log_det(gauge, self.dim)).to(log_prob.dtype)
+        return self.ray(obs, action, center).radial_log_prob(log_prob)
 
     def alpha_log_prob(
         self, obs: Tensor, action: Tensor, mean: Tensor, std: Tensor, center: Tensor | None = None
@@ -151,23 +158,7 @@ class Constraint(ABC):
 
         With respect to volume where `action` is feasible, to the boundary's surface measure where it is not.
         """
-        offset, center64, gauge, gradient = self._ray(obs, action, center)
-        mean, std = mean.double(), std.double()
-        residual = (action.double() - mean) / std
-        interior = -(0.5 * residual**2 + std.log()).sum(-1) - 0.5 * self.dim * math.log(2.0 * math.pi)
-        inside = gauge <= 1.0
-        # Harmless stand-ins inside keep the unused branch, and so its gradient, finite.
-        spread = inside.unsqueeze(-1)
-        to_boundary = torch.where(spread, 1.0, offset / torch.where(inside, 1.0, gauge).unsqueeze(-1))
-        origin = torch.zeros_like(offset) if center64 is None else center64.expand_as(offset)
-        boundary = alpha_boundary_log_density(
-            to_boundary,
-            torch.where(spread, 1.0, gradient),
-            origin,
-            mean.expand_as(offset),
-            std.expand_as(offset),
-        )
-        return torch.where(inside, interior, boundary).to(action.dtype)
+        return self.ray(obs, action, center).alpha_log_prob(mean, std)
 
     def linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction)."""
@@ -186,33 +177,13 @@ class Constraint(ABC):
         lead = torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1])
         return obs.detach().double(), action.double().expand(*lead, self.dim)
 
-    def _gauge64(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
-        # L is homogeneous: scaling the direction first keeps squares and products in range at any length.
-        largest = direction.detach().abs().amax(-1)
-        scale = torch.where(largest > 0.0, largest, 1.0)
-        gauge, gradient = self._gauge_and_gradient(obs, direction / scale.unsqueeze(-1), center)
-        return gauge * scale, gradient
-
-    def _ray(self, obs: Tensor, action: Tensor, center: Tensor | None):
-        """(action - center, center or None for the origin, gauge of the offset, the gauge's gradient)."""
-        obs64, action64 = self._broadcast(obs, action)
-        if center is None and not self.origin_centered:
-            center = self.center(obs64)
-        center64 = None if center is None else center.detach().double()
-        offset = action64 if center64 is None else action64 - center64
-        gauge, gradient = self._gauge64(obs64, offset, center64)
-        return offset, center64, gauge, gradient
-
-    def _pull_in(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Removes a rounding excess by moving towards the origin, which must be interior."""
-        return action / self._gauge64(obs, action, None)[0].clamp(min=1.0).unsqueeze(-1)
-
 
 def box_gauge_gradient(direction: Tensor, center: Tensor | None) -> Tensor:
     """Gradient (..., d) of the box's gauge: the row of the face that the ray meets first."""
-    sign = direction.detach().sign()
+    direction = direction.detach()
+    sign = direction.sign()
     slope = sign if center is None else sign / (1.0 - sign * center)
-    first = (slope * direction.detach()).argmax(-1, keepdim=True)
+    first = (slope * direction).argmax(-1, keepdim=True)
     return torch.zeros_like(slope).scatter(-1, first, slope.gather(-1, first))
 
 
@@ -221,40 +192,40 @@ def largest_gauge(direction: Tensor, *gradients: Tensor) -> tuple[Tensor, Tensor
 
     A gauge is homogeneous, so its value is <gradient, direction> (Euler).
     """
-    gradient = gradients[0]
-    gauge = (gradient * direction).sum(-1)
+    direction, gradient = direction.detach(), gradients[0]
+    gauge = (gradient.detach() * direction).sum(-1)
     for other in gradients[1:]:
-        value = (other * direction).sum(-1)
-        larger = value > gauge
-        gauge = torch.where(larger, value, gauge)
-        gradient = torch.where(larger.unsqueeze(-1), other, gradient)
+        value = (other.detach() * direction).sum(-1)
+        gradient = torch.where((value > gauge).unsqueeze(-1), other, gradient)
+        gauge = torch.maximum(gauge, value)
     return gauge, gradient
 
 
 def deflated_jacobian(curvature: Tensor, *normals: Tensor) -> JacobianProduct:
     """Jacobian product of a projection by implicit differentiation of its KKT conditions.
 
-    curvature (..., d): diagonal inverse Hessian of the Lagrangian, 0 on coordinates that are held fixed.
+    curvature (..., d): diagonal inverse Hessian of the Lagrangian, 0 (or False) on coordinates that are held fixed.
     normals (..., d): gradient of each active constraint, 0 where it is inactive. Each takes the direction it blocks
     out of J: J <- J - (J n)(J n)' / (n' J n).
     """
 
     def product(vector: Tensor) -> Tensor:
+        out = curvature * vector
         removed: list[tuple[Tensor, Tensor]] = []
-
-        def apply(v: Tensor) -> Tensor:
-            out = curvature * v
-            for column, pivot in removed:
-                out = out - column * ((column * v).sum(-1, keepdim=True) / pivot)
-            return out
-
         for normal in normals:
-            column = apply(normal)
+            column = curvature * normal
             pivot = (normal * column).sum(-1, keepdim=True)
-            # No freedom left along this normal (it is inactive, or spanned by those before it): nothing to remove.
-            blocked = pivot > 1e-12 * (normal * curvature * normal).sum(-1, keepdim=True)
-            removed.append((torch.where(blocked, column, 0.0), torch.where(blocked, pivot, 1.0)))
-        return apply(vector)
+            if removed:
+                own = pivot
+                for other, other_pivot in removed:
+                    column = column - other * ((other * normal).sum(-1, keepdim=True) / other_pivot)
+                pivot = (normal * column).sum(-1, keepdim=True)
+                # No freedom left along this normal, which those before it span: nothing to remove.
+                column = column * (pivot > 1e-12 * own)
+            pivot = pivot.clamp(min=1e-300)  # 0 where the normal is inactive, and then so is the column
+            out = out - column * ((normal * out).sum(-1, keepdim=True) / pivot)
+            removed.append((column, pivot))
+        return out
 
     return product
 
@@ -268,8 +239,8 @@ class _Projection(torch.autograd.Function):
         return projected.to(action.dtype)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor):
+        refuse_second_derivatives()
         return ctx.jacobian_product(grad.double()).to(grad.dtype), None
 
 

@@ -17,10 +17,11 @@ _NODES = 28  # Gauss-Legendre nodes on the window of the ray integral
 _DROP = 25.0  # the window ends where the log of the integrand has fallen by at least this much
 
 
-def _refuse_second_derivatives() -> None:
+def refuse_second_derivatives() -> None:
+    """Called in the backward of a function whose gradient is a closed form. RuntimeError under `create_graph=True`."""
     # PyTorch's once_differentiable would let them pass as zeros: the saved tensors carry no graph.
     if torch.is_grad_enabled():
-        raise RuntimeError("the log-densities of the radial and alpha maps have first derivatives only")
+        raise RuntimeError("projections, maps and their log-densities have first derivatives only")
 
 
 class _RadialLogDet(torch.autograd.Function):
@@ -42,7 +43,7 @@ class _RadialLogDet(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
-        _refuse_second_derivatives()
+        refuse_second_derivatives()
         (slope,) = ctx.saved_tensors
         return grad * slope, None
 
@@ -135,7 +136,7 @@ class _AlphaBoundaryLogDensity(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad):
-        _refuse_second_derivatives()
+        refuse_second_derivatives()
         normal, normal_square, std, ray, foot, residual, slope, by_slope, by_intercept = ctx.saved_tensors
         grad = grad.double()
         # Derivatives by start and ray are -E[start + t ray] and -E[t (start + t ray)] under the integrand.

@@ -15,7 +15,11 @@ from constraints.base import (
     largest_gauge,
     safe_sqrt,
 )
-from constraints.separable import minimize_under_ellipse
+from constraints.separable import Solution, minimize_under_ellipse
+
+_ROUNDING = 1e-13
+# Newton needs 3 to 10 steps.
+_MAX_STEPS = 40
 
 
 class DiagonalEllipse(Constraint):
@@ -38,24 +42,24 @@ class DiagonalEllipse(Constraint):
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         return self._violation(obs, action).clamp(min=0.0)
 
-    def _solve(self, obs: Tensor, target: Tensor, shift: float) -> tuple[Tensor, Tensor]:
-        def clipped(metric: Tensor) -> tuple[Tensor, Tensor, None]:
-            solution = (target / metric.clamp(min=1e-300)).clamp(-1.0, 1.0)
-            return solution, solution.abs() < 1.0, None
+    def _solve(self, obs: Tensor, target: Tensor, shift: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The minimiser (..., d), its metric (..., d), its free coordinates and the active ellipse's normal."""
+        scale, size = self.scale(obs), target.abs()
 
-        return minimize_under_ellipse(clipped, target, shift, self.scale(obs), self.bound)
+        def clipped(metric: Tensor) -> Solution:
+            point = (size / metric.clamp(min=1e-300)).clamp(max=1.0)
+            return Solution(point, point < 1.0, torch.zeros_like(point))
+
+        (point, free, _), mu = minimize_under_ellipse(clipped, size, shift, scale, self.bound)
+        solution = torch.copysign(within_ellipse(point, scale * point, self.bound), target)
+        return solution, mu * scale + shift, free, scale * solution * (mu > 0.0)
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        solution, mu = self._solve(obs, action, 1.0)
-        curvature = (solution.abs() < 1.0) / (1.0 + mu * self.scale(obs))
-        return self._pull_in(obs, solution), deflated_jacobian(curvature, self.normal(obs, solution, mu))
-
-    def normal(self, obs: Tensor, solution: Tensor, mu: Tensor) -> Tensor:
-        """Normal (..., d) of the ellipse where its multiplier says that it is active, 0 elsewhere."""
-        return torch.where(mu > 0.0, self.scale(obs) * solution, 0.0)
+        solution, metric, free, normal = self._solve(obs, action, 1.0)
+        return solution, deflated_jacobian(free / metric, normal)
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        return self._pull_in(obs, self._solve(obs, gradient, 0.0)[0])
+        return self._solve(obs, gradient, 0.0)[0]
 
     def gauge_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
         """Gradient (..., d) of the gauge of the ellipse, the box left out."""
@@ -86,101 +90,147 @@ class PlanarEllipse(Constraint):
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         matrix = self.matrix(obs)
-        value = (action * _times(matrix, action)).sum(-1)
+        value = _Planar(matrix, self.bound).value(action).squeeze(-1)
         return ellipse_excess(value, matrix.diagonal(dim1=-2, dim2=-1).sum(-1), self.bound, 2)
 
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         return self._violation(obs, action).clamp(min=0.0)
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        matrix = self.matrix(obs).expand(*action.shape[:-1], 2, 2)
+        planar = _Planar(self.matrix(obs), self.bound)
         boxed = action.clamp(-1.0, 1.0)
-        on_ellipse, tangent_jacobian = self._project_on_ellipse(matrix, action)
-        low, high = self._face_intervals(matrix)
-        along = action.flip(-1).unsqueeze(-1)
-        moved = along.clamp(low, high)
+        in_ellipse = planar.value(boxed) <= self.bound
+        on_ellipse, mu = planar.project(action)
+        in_box = on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + _ROUNDING
 
-        points = torch.cat((boxed.unsqueeze(-2), on_ellipse.unsqueeze(-2), _face_points(moved)), -2)
-        # A rounding excess over the box is pulled in below; faces have their own, exact, candidates.
-        valid = (
-            (boxed * _times(matrix, boxed)).sum(-1, keepdim=True) <= self.bound,
-            on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + 1e-12,
-            (low <= high).flatten(-2),
-        )
-        distance = (points - action.unsqueeze(-2)).square().sum(-1)
-        case = torch.where(torch.cat(valid, -1), distance, torch.inf).argmin(-1, keepdim=True)
-        solution = points.take_along_dim(case.unsqueeze(-1), -2).squeeze(-2)
+        # The best point of a face, mirrored to a_i = 1, is that of its interval nearest to the other coordinate.
+        own, other = _mirrored(action), _mirrored(action.flip(-1))
+        low, high, met = planar.faces()
+        moved = torch.minimum(torch.maximum(other, low), high)
+        distance = (own - 1.0).square() + (other - moved).square()
+        face = distance.masked_fill(~met, torch.inf).flatten(-2).argmin(-1, keepdim=True)
+        on_face = _on_face(face, moved.flatten(-2).gather(-1, face))
+        slides = ((moved > low) & (moved < high)).flatten(-2).gather(-1, face)
 
-        # On a face only the other coordinate moves, unless the ellipse holds it too; in the box both may.
-        slides = _face_points(((moved > low) & (moved < high)).double(), fixed=0.0)
-        inside = (action.abs() < 1.0).double().unsqueeze(-2)
-        free = torch.cat((inside, torch.zeros_like(inside), slides), -2)
-        free = free.take_along_dim(case.unsqueeze(-1), -2).squeeze(-2)
+        solution = torch.where(in_ellipse, boxed, torch.where(in_box, on_ellipse, on_face))
 
         def product(vector: Tensor) -> Tensor:
-            return torch.where(case == 1, tangent_jacobian(vector), free * vector)
+            in_metric = planar.in_metric(vector, mu)
+            normal = planar.times(on_ellipse)
+            column = planar.in_metric(normal, mu)
+            pivot = (normal * column).sum(-1, keepdim=True).clamp(min=1e-300)
+            tangent = in_metric - column * ((normal * in_metric).sum(-1, keepdim=True) / pivot)
+            clipped = vector * (action.abs() < 1.0)
+            along = vector * slides * torch.cat((face > 1, face < 2), -1)
+            return torch.where(in_ellipse, clipped, torch.where(in_box, tangent, along))
 
-        return self._pull_in(obs, solution), product
-
-    def _project_on_ellipse(self, matrix: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        """Projection on the ellipse alone, in the axes of `matrix`, and its Jacobian product."""
-        first, cross, second = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
-        angle = 0.5 * torch.atan2(2.0 * cross, first - second)
-        cos, sin = angle.cos(), angle.sin()
-        axes = torch.stack((torch.stack((cos, -sin), -1), torch.stack((sin, cos), -1)), -2)
-        spread = torch.hypot(0.5 * (first - second), cross)
-        mean = 0.5 * (first + second)
-        scale = torch.stack((mean + spread, (mean - spread).clamp(min=0.0)), -1)
-        target = _times(axes.mT, action)
-
-        def unbounded(metric: Tensor) -> tuple[Tensor, Tensor, None]:
-            return target / metric, torch.ones_like(metric), None
-
-        solution, mu = minimize_under_ellipse(unbounded, target, 1.0, scale, self.bound)
-        jacobian = deflated_jacobian(1.0 / (1.0 + mu * scale), torch.where(mu > 0.0, scale * solution, 0.0))
-        return _times(axes, solution), lambda vector: _times(axes, jacobian(_times(axes.mT, vector)))
-
-    def _face_intervals(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
-        """Feasible interval (low, high) of the other coordinate on the faces a_i = +-1, each (..., 2, 2) over
-        (i, sign); empty (low > high) where the face is infeasible."""
-        held = matrix.diagonal(dim1=-2, dim2=-1).unsqueeze(-1)
-        moved = held.flip(-2)
-        cross = matrix[..., 0, 1, None, None] * torch.tensor([1.0, -1.0], dtype=matrix.dtype, device=matrix.device)
-        discriminant = cross**2 - moved * (held - self.bound)
-        root = discriminant.clamp(min=0.0).sqrt()
-        curved = moved > 0.0
-        safe = torch.where(curved, moved, 1.0)
-        low = torch.where(curved, (-cross - root) / safe, -1.0).clamp(min=-1.0)
-        high = torch.where(curved, (-cross + root) / safe, 1.0).clamp(max=1.0)
-        met = torch.where(curved, discriminant >= 0.0, held <= self.bound)
-        return torch.where(met, low, 2.0), torch.where(met, high, -2.0)
+        return within_ellipse(solution, planar.times(solution), self.bound), product
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        matrix = self.matrix(obs).expand(*gradient.shape[:-1], 2, 2)
-        # The maximiser over the ellipse alone, along inv(Q) gradient = adj(Q) gradient / det Q.
-        diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-        ascent = diagonal.flip(-1) * gradient - matrix[..., 0, 1, None] * gradient.flip(-1)
-        size = (ascent * _times(matrix, ascent)).sum(-1, keepdim=True)
-        on_ellipse = ascent * (self.bound / size).sqrt()
-        low, high = self._face_intervals(matrix)
-        ends = torch.cat((_face_points(low), _face_points(high)), -2)
-        met = (low <= high).flatten(-2)
-        origin = torch.zeros_like(gradient)
-        points = torch.cat((torch.stack((origin, on_ellipse), -2), ends), -2)
-        inside = on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + 1e-12
-        valid = torch.cat((torch.ones_like(inside), inside, met, met), -1)
-        value = torch.where(valid, (points * gradient.unsqueeze(-2)).sum(-1), -torch.inf)
-        best = value.argmax(-1, keepdim=True).unsqueeze(-1)
-        return self._pull_in(obs, points.take_along_dim(best, -2).squeeze(-2))
+        planar = _Planar(self.matrix(obs), self.bound)
+        # The maximiser over the ellipse alone is along inv(Q) gradient = adj(Q) gradient / det Q.
+        ascent = planar.adjugate_times(gradient)
+        on_ellipse = ascent * (self.bound / planar.value(ascent).clamp(min=1e-300)).sqrt()
+        in_box = on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + _ROUNDING
+
+        own, other = _mirrored(gradient), _mirrored(gradient.flip(-1))
+        low, high, met = planar.faces()
+        moved = torch.where(other > 0.0, high, low)
+        value, face = (own + other * moved).masked_fill(~met, -torch.inf).flatten(-2).max(-1, keepdim=True)
+        on_face = _on_face(face, moved.flatten(-2).gather(-1, face))
+        best = in_box & ((on_ellipse * gradient).sum(-1, keepdim=True) >= value)
+        solution = torch.where(best, on_ellipse, on_face)
+        return within_ellipse(solution, planar.times(solution), self.bound)
 
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
-        matrix = self.matrix(obs)
-        bent = None if center is None else _times(matrix, center)
+        planar = _Planar(self.matrix(obs), self.bound)
+        bent = None if center is None else planar.times(center)
         return largest_gauge(
             direction,
             box_gauge_gradient(direction, center),
-            ellipse_gauge_gradient(direction, _times(matrix, direction), center, bent, self.bound),
+            ellipse_gauge_gradient(direction, planar.times(direction), center, bent, self.bound),
         )
+
+
+class _Planar:
+    """Arithmetic of one symmetric matrix (..., 2, 2) by its entries; vectors are (..., 2), scalars (..., 1)."""
+
+    def __init__(self, matrix: Tensor, bound: float):
+        self.bound = bound
+        self.diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+        self.cross = matrix[..., 0, 1:]
+
+    def times(self, vector: Tensor) -> Tensor:
+        return torch.addcmul(self.diagonal * vector, self.cross, vector.flip(-1))
+
+    def adjugate_times(self, vector: Tensor) -> Tensor:
+        return torch.addcmul(self.diagonal.flip(-1) * vector, self.cross, vector.flip(-1), value=-1.0)
+
+    def value(self, vector: Tensor) -> Tensor:
+        return (vector * self.times(vector)).sum(-1, keepdim=True)
+
+    def determinant(self) -> Tensor:
+        return (self.diagonal.prod(-1, keepdim=True) - self.cross.square()).clamp(min=0.0)
+
+    def in_metric(self, vector: Tensor, mu: Tensor) -> Tensor:
+        """inv(1 + mu Q) vector."""
+        trace = self.diagonal.sum(-1, keepdim=True)
+        scale = 1.0 + mu * (trace + mu * self.determinant())
+        return torch.addcmul(vector, mu, self.adjugate_times(vector)) / scale
+
+    def project(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Projection (..., 2) on the ellipse alone, and its multiplier mu (..., 1).
+
+        The point is inv(1 + mu Q) action, whose value a'Qa is numerator / scale^2 with both polynomials in mu. Newton's
+        method on 1 / sqrt(value), which is concave and rises: from the left it never passes the root.
+        """
+        trace, determinant = self.diagonal.sum(-1, keepdim=True), self.determinant()
+        start = self.value(action)
+        half_slope = determinant * action.square().sum(-1, keepdim=True)
+        curvature = determinant * (action * self.adjugate_times(action)).sum(-1, keepdim=True)
+        root_bound = self.bound**0.5
+        mu = torch.zeros_like(start)
+        for _ in range(_MAX_STEPS):
+            tilt = mu * determinant
+            bend = mu * curvature
+            scale = 1.0 + mu * (trace + tilt)
+            value = start + mu * (2.0 * half_slope + bend)
+            root = value.sqrt()
+            rise = (trace + 2.0 * tilt) * value - scale * (half_slope + bend)
+            step = (value * (root / root_bound - scale) / rise).clamp(min=0.0).nan_to_num(0.0)
+            mu = mu + step
+            if action.is_cpu and not (step > 1e-15 * mu).any():
+                break
+        return torch.addcmul(action, mu, self.adjugate_times(action)) / (1.0 + mu * (trace + mu * determinant)), mu
+
+    def faces(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the faces a_1 = 1 and a_2 = 1, the interval (low, high) of the other coordinate that is feasible, and
+        whether there is one, each (..., 2, 1). Those of a_i = -1 are the same, mirrored."""
+        held, moved = self.diagonal, self.diagonal.flip(-1).clamp(min=1e-200)
+        discriminant = self.cross.square() - moved * (held - self.bound)
+        root = discriminant.clamp(min=0.0).sqrt()
+        low, high = ((-self.cross - root) / moved).clamp(min=-1.0), ((root - self.cross) / moved).clamp(max=1.0)
+        met = (discriminant >= 0.0) & (low <= high)
+        return low.unsqueeze(-1), high.unsqueeze(-1), met.unsqueeze(-1)
+
+
+def _mirrored(vector: Tensor) -> Tensor:
+    """(..., 2, 2): each coordinate, and with its sign turned."""
+    return torch.stack((vector, -vector), -1)
+
+
+def _on_face(face: Tensor, moved: Tensor) -> Tensor:
+    """Point (..., 2) with the other coordinate `moved` (mirrored) on face 0 to 3: a_1 = 1, a_1 = -1, a_2 = 1, -1."""
+    point = torch.where(
+        face < 2, torch.cat((torch.ones_like(moved), moved), -1), torch.cat((moved, torch.ones_like(moved)), -1)
+    )
+    return point * (1 - 2 * (face % 2))
+
+
+def within_ellipse(point: Tensor, bent: Tensor, bound: float) -> Tensor:
+    """The point (..., d), `bent` = Q point, with a rounding excess over point'Q point <= bound taken off."""
+    value = (point * bent).sum(-1, keepdim=True)
+    return point * (bound / value.clamp(min=bound)).sqrt()
 
 
 def ellipse_excess(value: Tensor, trace: Tensor, bound: Tensor | float, dim: int) -> Tensor:
@@ -211,17 +261,6 @@ def ellipse_gauge_gradient(
     met = square > 0.0
     root = torch.where(met, square, 1.0).sqrt()
     return torch.where(met, (bent_center + (slope * bent_center + slack * bent_direction) / root) / slack, 0.0)
-
-
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix * vector.unsqueeze(-2)).sum(-1)
-
-
-def _face_points(moved: Tensor, fixed: float = 1.0) -> Tensor:
-    """Points (..., 4, 2) on the faces a_i = +-fixed, from the other coordinate (..., 2, 2) over (i, sign)."""
-    sign = torch.tensor([fixed, -fixed], dtype=moved.dtype, device=moved.device).expand_as(moved)
-    points = torch.stack((sign, moved), -1)
-    return torch.cat((points[..., 0, :, :], points[..., 1, :, :].flip(-1)), -2)
 
 
 def _check_bound(bound: float) -> None:

@@ -14,8 +14,8 @@ from constraints.base import (
     deflated_jacobian,
     largest_gauge,
 )
-from constraints.ellipse import DiagonalEllipse
-from constraints.separable import RowProblem, minimize_under_ellipse
+from constraints.ellipse import DiagonalEllipse, within_ellipse
+from constraints.separable import minimize_under_ellipse
 from constraints.weighted import WeightedL1
 
 
@@ -40,23 +40,19 @@ class WeightedL1AndEllipse(Constraint):
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         return self.l1._penalty(obs, action) + self.ellipse._penalty(obs, action)
 
-    def _solve(self, problem: RowProblem, obs: Tensor, shift: float) -> tuple[Tensor, Tensor]:
-        def under_row(metric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            solution, row = problem.solve(metric)
-            return solution, problem.inside(solution), row
-
-        return minimize_under_ellipse(under_row, problem.target, shift, self.ellipse.scale(obs), self.ellipse.bound)
+    def _solve(self, obs: Tensor, target: Tensor, shift: float) -> tuple[Tensor, JacobianProduct]:
+        scale = self.ellipse.scale(obs)
+        problem = self.l1.row_problem(obs, target)
+        (point, free, row), mu = minimize_under_ellipse(problem.solve, target, shift, scale, self.ellipse.bound)
+        solution = torch.copysign(within_ellipse(point, scale * point, self.ellipse.bound), target)
+        normal = scale * solution * (mu > 0.0)
+        return solution, deflated_jacobian(free / (mu * scale + shift), torch.copysign(row, target), normal)
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        problem = self.l1.row_problem(obs, action)
-        _, mu = self._solve(problem, obs, 1.0)
-        metric = 1.0 + mu * self.ellipse.scale(obs)
-        solution, row = problem.solve(metric)
-        curvature = problem.free(solution, row) / metric
-        return self._pull_in(obs, solution), deflated_jacobian(curvature, row, self.ellipse.normal(obs, solution, mu))
+        return self._solve(obs, action, 1.0)
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        return self._pull_in(obs, self._solve(self.l1.row_problem(obs, gradient), obs, 0.0)[0])
+        return self._solve(obs, gradient, 0.0)[0]
 
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         return largest_gauge(

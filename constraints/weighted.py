@@ -42,30 +42,11 @@ class _WeightPatterns(Constraint):
 
     @abstractmethod
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
-        """The row (..., d) with the largest value in the orthant `side` (..., d), entries in {-1, 0, 1}."""
+        """The row (..., d) with the largest value in the orthant of `side` (..., d)."""
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         rows = self.weight(obs).unsqueeze(-2) * self._patterns(obs.device)
         return rows, torch.full_like(rows[..., 0], self.bound), []
-
-    def row_problem(self, obs: Tensor, target: Tensor) -> RowProblem:
-        """The one row, in one orthant, that the projection of `target` or the oracle's answer for it has to mind.
-
-        The orthant is that of the target: the constraint never asks for the opposite sign.
-        """
-        weight, bound = self.scaled_weight(obs)
-        side = torch.where(target < 0.0, -1.0, 1.0)
-        return RowProblem(target, self._row(weight, side), bound, (side - 1.0) / 2.0, (side + 1.0) / 2.0)
-
-    def scaled_weight(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Weight (..., d) and bound (..., 1) divided by the largest |weight|, which may be 0 or 1e6.
-
-        What is then below 1e-100 counts as 0: it moves the row by less than any rounding.
-        """
-        weight = self.weight(obs)
-        scale = weight.abs().amax(-1, keepdim=True)
-        scale = torch.where(scale > 0.0, scale, 1.0)
-        return torch.nn.functional.hardshrink(weight / scale, 1e-100), self.bound / scale
 
     def _excess(self, obs: Tensor, action: Tensor) -> Tensor:
         """Ax - b (..., m) with unit rows; a zero row stays as it is."""
@@ -80,32 +61,35 @@ class _WeightPatterns(Constraint):
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         return safe_sqrt(self._excess(obs, action).clamp(min=0.0).square().sum(-1))
 
+    def row_problem(self, obs: Tensor, target: Tensor) -> RowProblem:
+        """The problem of the one row that the projection of `target`, or the oracle's answer for it, has to mind.
+
+        Mirrored to the orthant of the target: the constraint never asks for the opposite sign.
+        """
+        return RowProblem(target.abs(), self._row(self.weight(obs), target.sign()).abs(), self.bound)
+
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        problem = self.row_problem(obs, action)
-        solution, row = problem.solve(torch.ones_like(action))
-        return self._pull_in(obs, solution), deflated_jacobian(problem.free(solution, row).double(), row)
+        point, free, row = self.row_problem(obs, action).solve(1.0)
+        return torch.copysign(point, action), deflated_jacobian(free, torch.copysign(row, action))
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        solution, _ = self.row_problem(obs, gradient).solve(torch.zeros_like(gradient))
-        return self._pull_in(obs, solution)
+        return torch.copysign(self.row_problem(obs, gradient).solve(0.0).point, gradient)
 
     def gauge_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
         """Gradient (..., d) of the gauge of these rows, the box left out."""
-        weight, bound = self.scaled_weight(obs)
-        direction = direction.detach()
+        weight, direction = self.weight(obs), direction.detach()
         if center is None:
-            return self._row(weight, direction.sign()) / bound
+            return self._row(weight, direction.sign()) / self.bound
         # Along center + t direction the largest row value is convex and starts below the bound; its row changes only
         # where a coordinate crosses 0. The row that reaches the bound is the one after the last crossing below it.
         turns = center * direction < 0.0
-        crossing = torch.where(turns, -center / torch.where(turns, direction, 1.0), 0.0).clamp(max=1e300)
-        point = center.unsqueeze(-2) + crossing.unsqueeze(-1) * direction.unsqueeze(-2)
-        value = (self._row(weight.unsqueeze(-2), point.sign()) * point).sum(-1)
-        last = torch.where(value <= bound, crossing, 0.0).amax(-1, keepdim=True)
-        before = torch.where(center == 0.0, direction, center).sign()
-        side = torch.where(turns & (crossing <= last), direction.sign(), before)
-        row = self._row(weight, side)
-        return row / (bound - (row * center).sum(-1, keepdim=True))
+        crossing = torch.where(turns, -center / direction, 0.0).clamp(max=1e300)
+        point = torch.addcmul(center.unsqueeze(-2), crossing.unsqueeze(-1), direction.unsqueeze(-2))
+        value = (self._row(weight.unsqueeze(-2), point) * point).sum(-1)
+        last = ((value <= self.bound) * crossing).amax(-1, keepdim=True)
+        before = torch.where(center == 0.0, direction, center)
+        row = self._row(weight, torch.where(turns & (crossing <= last), direction, before).sign())
+        return row / (self.bound - (row * center).sum(-1, keepdim=True))
 
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         return largest_gauge(
@@ -120,7 +104,7 @@ class WeightedL1(_WeightPatterns):
         return _patterns((-1.0, 1.0), self.dim, device)
 
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
-        return weight.abs() * side
+        return weight.abs() * side.sign()
 
 
 class WeightedPositivePart(_WeightPatterns):
@@ -137,12 +121,12 @@ class WeightedPositivePart(_WeightPatterns):
     def _center(self, obs: Tensor) -> Tensor:
         # Of all subsets' rows, prefixes of the weights sorted downwards limit the radius. Many points attain it; this
         # one is continuous in obs.
-        weight, bound = self.scaled_weight(obs)
+        weight = self.weight(obs)
         ordered = weight.abs().sort(-1, descending=True).values
         total, norm = ordered.cumsum(-1), ordered.square().cumsum(-1).sqrt()
-        radius = ((bound + total) / (norm + total)).amin(-1, keepdim=True).clamp(max=1.0)
+        radius = ((self.bound + total) / (norm + total)).amin(-1, keepdim=True).clamp(max=1.0)
         room = 1.0 - radius
-        return -(radius**2 * weight / (2.0 * bound)).clamp(-room, room)
+        return -(radius**2 * weight / (2.0 * self.bound)).clamp(-room, room)
 
 
 class HalfSpace(_WeightPatterns):
@@ -157,22 +141,32 @@ class HalfSpace(_WeightPatterns):
         return torch.ones(1, self.dim, dtype=torch.float64, device=device)
 
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
-        return weight.expand(torch.broadcast_shapes(weight.shape, side.shape))
+        return weight
 
-    def row_problem(self, obs: Tensor, target: Tensor) -> RowProblem:
-        weight, bound = self.scaled_weight(obs)
-        one = torch.ones_like(target)
-        return RowProblem(target, self._row(weight, target), bound, -one, one)
+    def _solve(self, obs: Tensor, target: Tensor, metric: float) -> tuple[Tensor, JacobianProduct]:
+        # In coordinates 1 + a sign(w), which run from 0 to 2.
+        weight = self.weight(obs)
+        mirror = torch.copysign(torch.ones_like(weight), weight)
+        size = weight.abs()
+        total = size.sum(-1, keepdim=True)
+        point, free, row = RowProblem(mirror * target + metric, size, self.bound + total, top=2.0).solve(metric)
+        return mirror * (point - 1.0), deflated_jacobian(free, mirror * row)
+
+    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        return self._solve(obs, action, 1.0)
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        # Where the gradient is 0 every value is as good: take the one that relieves the row.
-        relief = -1e-150 * self.scaled_weight(obs)[0]
-        return super()._linear_oracle(obs, torch.where(gradient == 0.0, relief, gradient))
+        return self._solve(obs, gradient, 0.0)[0]
+
+    def gauge_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
+        weight = self.weight(obs)
+        slack = self.bound if center is None else self.bound - (weight * center).sum(-1, keepdim=True)
+        return weight / slack
 
     def _center(self, obs: Tensor) -> Tensor:
-        weight, bound = self.scaled_weight(obs)
+        weight = self.weight(obs)
         total, norm = weight.abs().sum(-1, keepdim=True), weight.norm(dim=-1, keepdim=True)
-        radius = ((bound + total) / (norm + total)).clamp(max=1.0)
+        radius = ((self.bound + total) / (norm + total)).clamp(max=1.0)
         return -(1.0 - radius) * weight.sign()
 
 

@@ -55,7 +55,10 @@ class Constraint(ABC):
 
     @abstractmethod
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        """Closest feasible point (..., d) and the product with the projection's Jacobian there."""
+        """Closest feasible point (..., d) and the product with the projection's Jacobian there.
+
+        NaN where the action is NaN, at least in that coordinate: a broken policy must not become feasible unnoticed.
+        """
 
     @abstractmethod
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -97,10 +100,9 @@ class Constraint(ABC):
 
     def project(self, obs: Tensor, action: Tensor) -> Tensor:
         """Closest feasible point (..., d) in the Euclidean norm, with its exact Jacobian in `action`."""
-        obs64, action64 = self._broadcast(obs, action.detach())
         with torch.no_grad():
-            projected, jacobian_product = self._project(obs64, action64)
-            solution = _keep_nan(projected, action64), jacobian_product
+            obs64, action64 = self._broadcast(obs, action)
+            solution = self._project(obs64, action64)
         if torch.is_grad_enabled() and action.requires_grad:
             return _Projection.apply(action.expand(action64.shape), solution)
         return solution[0].to(action.dtype)
@@ -162,20 +164,22 @@ class Constraint(ABC):
 
     def linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction)."""
-        obs64, gradient64 = self._broadcast(obs, gradient.detach())
         with torch.no_grad():
+            obs64, gradient64 = self._broadcast(obs, gradient)
             # Only the direction matters: at length 1 the squares of tiny gradients stay above zero.
             largest = gradient64.abs().amax(-1, keepdim=True)
             gradient64 = gradient64 / torch.where(largest > 0.0, largest, 1.0)
-            return _keep_nan(self._linear_oracle(obs64, gradient64), gradient64).to(gradient.dtype)
+            return keep_nan(self._linear_oracle(obs64, gradient64), gradient64).to(gradient.dtype)
 
     # ---------------------------------------------------------------- shared pieces
 
     def _broadcast(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         if action.shape[-1] != self.dim:
             raise ValueError(f"expected {self.dim} action coordinates, got {action.shape[-1]}")
-        lead = torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1])
-        return obs.detach().double(), action.double().expand(*lead, self.dim)
+        obs, action = obs.detach().double(), action.double()
+        if obs.shape[:-1] != action.shape[:-1]:
+            action = action.expand(*torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1]), self.dim)
+        return obs, action
 
 
 def box_gauge_gradient(direction: Tensor, center: Tensor | None) -> Tensor:
@@ -244,8 +248,8 @@ class _Projection(torch.autograd.Function):
         return ctx.jacobian_product(grad.double()).to(grad.dtype), None
 
 
-def _keep_nan(solution: Tensor, source: Tensor) -> Tensor:
-    """NaN wherever the source has one: a broken policy must not turn into a feasible action unnoticed."""
+def keep_nan(solution: Tensor, source: Tensor) -> Tensor:
+    """The solution (..., d), all NaN where the source (..., d) has one."""
     return torch.where(source.isnan().any(-1, keepdim=True), torch.nan, solution)
 
 

@@ -12,10 +12,11 @@ from constraints.base import (
     JacobianProduct,
     box_gauge_gradient,
     deflated_jacobian,
+    keep_nan,
     largest_gauge,
     safe_sqrt,
 )
-from constraints.separable import Solution, minimize_under_ellipse
+from constraints.separable import BoxProblem, RowProblem, minimize_under_ellipse
 
 _ROUNDING = 1e-13
 # Newton needs 3 to 10 steps.
@@ -42,24 +43,11 @@ class DiagonalEllipse(Constraint):
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         return self._violation(obs, action).clamp(min=0.0)
 
-    def _solve(self, obs: Tensor, target: Tensor, shift: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The minimiser (..., d), its metric (..., d), its free coordinates and the active ellipse's normal."""
-        scale, size = self.scale(obs), target.abs()
-
-        def clipped(metric: Tensor) -> Solution:
-            point = (size / metric.clamp(min=1e-300)).clamp(max=1.0)
-            return Solution(point, point < 1.0, torch.zeros_like(point))
-
-        (point, free, _), mu = minimize_under_ellipse(clipped, size, shift, scale, self.bound)
-        solution = torch.copysign(within_ellipse(point, scale * point, self.bound), target)
-        return solution, mu * scale + shift, free, scale * solution * (mu > 0.0)
-
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        solution, metric, free, normal = self._solve(obs, action, 1.0)
-        return solution, deflated_jacobian(free / metric, normal)
+        return minimize_in_ellipse(BoxProblem(action.abs()), action, 1.0, self.scale(obs), self.bound)
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        return self._solve(obs, gradient, 0.0)[0]
+        return minimize_in_ellipse(BoxProblem(gradient.abs()), gradient, 0.0, self.scale(obs), self.bound)[0]
 
     def gauge_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
         """Gradient (..., d) of the gauge of the ellipse, the box left out."""
@@ -124,7 +112,8 @@ class PlanarEllipse(Constraint):
             along = vector * slides * torch.cat((face > 1, face < 2), -1)
             return torch.where(in_ellipse, clipped, torch.where(in_box, tangent, along))
 
-        return within_ellipse(solution, planar.times(solution), self.bound), product
+        solution = within_ellipse(solution, planar.times(solution), self.bound)
+        return keep_nan(solution, action), product
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         planar = _Planar(self.matrix(obs), self.bound)
@@ -185,23 +174,24 @@ class _Planar:
         method on 1 / sqrt(value), which is concave and rises: from the left it never passes the root.
         """
         trace, determinant = self.diagonal.sum(-1, keepdim=True), self.determinant()
+        adjugate = self.adjugate_times(action)
         start = self.value(action)
         half_slope = determinant * action.square().sum(-1, keepdim=True)
-        curvature = determinant * (action * self.adjugate_times(action)).sum(-1, keepdim=True)
+        half_bend = determinant * (action * adjugate).sum(-1, keepdim=True)
         root_bound = self.bound**0.5
         mu = torch.zeros_like(start)
         for _ in range(_MAX_STEPS):
-            tilt = mu * determinant
-            bend = mu * curvature
-            scale = 1.0 + mu * (trace + tilt)
-            value = start + mu * (2.0 * half_slope + bend)
-            root = value.sqrt()
-            rise = (trace + 2.0 * tilt) * value - scale * (half_slope + bend)
-            step = (value * (root / root_bound - scale) / rise).clamp(min=0.0).nan_to_num(0.0)
+            turn = mu * determinant
+            slope = torch.addcmul(half_slope, mu, half_bend)
+            scale = 1.0 + mu * (trace + turn)
+            value = start + mu * (half_slope + slope)
+            rise = torch.addcmul((trace + 2.0 * turn) * value, scale, slope, value=-1.0).clamp_(min=1e-300)
+            step = (value.sqrt().div_(root_bound) - scale).mul_(value).div_(rise).clamp_(min=0.0)
             mu = mu + step
-            if action.is_cpu and not (step > 1e-15 * mu).any():
+            # As in minimize_under_ellipse. A NaN counts as settled.
+            if action.is_cpu and not (step > 1e-12 * mu).any():
                 break
-        return torch.addcmul(action, mu, self.adjugate_times(action)) / (1.0 + mu * (trace + mu * determinant)), mu
+        return torch.addcmul(action, mu, adjugate) / (1.0 + mu * (trace + mu * determinant)), mu
 
     def faces(self) -> tuple[Tensor, Tensor, Tensor]:
         """Of the faces a_1 = 1 and a_2 = 1, the interval (low, high) of the other coordinate that is feasible, and
@@ -225,6 +215,21 @@ def _on_face(face: Tensor, moved: Tensor) -> Tensor:
         face < 2, torch.cat((torch.ones_like(moved), moved), -1), torch.cat((moved, torch.ones_like(moved)), -1)
     )
     return point * (1 - 2 * (face % 2))
+
+
+def minimize_in_ellipse(
+    problem: RowProblem | BoxProblem, target: Tensor, shift: float, scale: Tensor, bound: float
+) -> tuple[Tensor, JacobianProduct]:
+    """Minimiser (..., d) of sum(shift a^2 / 2 - target a) over a problem's set, which mirrors the target, and
+    sum(scale a^2) <= bound; and the product with its Jacobian in the target."""
+    solution, metric, mu = minimize_under_ellipse(problem, shift, scale, bound)
+    point = torch.copysign(within_ellipse(solution.point, scale * solution.point, bound), target)
+
+    def product(vector: Tensor) -> Tensor:
+        normal = scale * point * (mu > 0.0)
+        return deflated_jacobian(solution.moves() / metric, torch.copysign(solution.row(), target), normal)(vector)
+
+    return point, product
 
 
 def within_ellipse(point: Tensor, bent: Tensor, bound: float) -> Tensor:

@@ -11,11 +11,9 @@ from constraints.base import (
     ExplicitSet,
     JacobianProduct,
     box_gauge_gradient,
-    deflated_jacobian,
     largest_gauge,
 )
-from constraints.ellipse import DiagonalEllipse, within_ellipse
-from constraints.separable import minimize_under_ellipse
+from constraints.ellipse import DiagonalEllipse, minimize_in_ellipse
 from constraints.weighted import WeightedL1
 
 
@@ -40,19 +38,13 @@ class WeightedL1AndEllipse(Constraint):
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         return self.l1._penalty(obs, action) + self.ellipse._penalty(obs, action)
 
-    def _solve(self, obs: Tensor, target: Tensor, shift: float) -> tuple[Tensor, JacobianProduct]:
-        scale = self.ellipse.scale(obs)
-        problem = self.l1.row_problem(obs, target)
-        (point, free, row), mu = minimize_under_ellipse(problem.solve, target, shift, scale, self.ellipse.bound)
-        solution = torch.copysign(within_ellipse(point, scale * point, self.ellipse.bound), target)
-        normal = scale * solution * (mu > 0.0)
-        return solution, deflated_jacobian(free / (mu * scale + shift), torch.copysign(row, target), normal)
-
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        return self._solve(obs, action, 1.0)
+        problem = self.l1.row_problem(obs, action)
+        return minimize_in_ellipse(problem, action, 1.0, self.ellipse.scale(obs), self.ellipse.bound)
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        return self._solve(obs, gradient, 0.0)[0]
+        problem = self.l1.row_problem(obs, gradient)
+        return minimize_in_ellipse(problem, gradient, 0.0, self.ellipse.scale(obs), self.ellipse.bound)[0]
 
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         return largest_gauge(

@@ -66,11 +66,15 @@ class _WeightPatterns(Constraint):
 
         Mirrored to the orthant of the target: the constraint never asks for the opposite sign.
         """
-        return RowProblem(target.abs(), self._row(self.weight(obs), target.sign()).abs(), self.bound)
+        return RowProblem(target.abs(), self._row(self.weight(obs), target).abs(), self.bound)
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        point, free, row = self.row_problem(obs, action).solve(1.0)
-        return torch.copysign(point, action), deflated_jacobian(free, torch.copysign(row, action))
+        solution = self.row_problem(obs, action).solve()
+
+        def product(vector: Tensor) -> Tensor:
+            return deflated_jacobian(solution.moves(), torch.copysign(solution.row(), action))(vector)
+
+        return torch.copysign(solution.point, action), product
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         return torch.copysign(self.row_problem(obs, gradient).solve(0.0).point, gradient)
@@ -143,20 +147,26 @@ class HalfSpace(_WeightPatterns):
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
         return weight
 
-    def _solve(self, obs: Tensor, target: Tensor, metric: float) -> tuple[Tensor, JacobianProduct]:
-        # In coordinates 1 + a sign(w), which run from 0 to 2.
+    def _mirrored(self, obs: Tensor, target: Tensor, metric: float) -> tuple[RowProblem, Tensor]:
+        """The problem in coordinates 1 + a sign(w), which run from 0 to 2, and the signs (..., d)."""
         weight = self.weight(obs)
-        mirror = torch.copysign(torch.ones_like(weight), weight)
         size = weight.abs()
-        total = size.sum(-1, keepdim=True)
-        point, free, row = RowProblem(mirror * target + metric, size, self.bound + total, top=2.0).solve(metric)
-        return mirror * (point - 1.0), deflated_jacobian(free, mirror * row)
+        sign = torch.copysign(torch.ones_like(weight), weight)
+        bound = size.sum(-1, keepdim=True) + self.bound
+        return RowProblem(sign * target + metric, size, bound, top=2.0), sign
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        return self._solve(obs, action, 1.0)
+        problem, sign = self._mirrored(obs, action, 1.0)
+        solution = problem.solve()
+
+        def product(vector: Tensor) -> Tensor:
+            return deflated_jacobian(solution.moves(), sign * solution.row())(vector)
+
+        return sign * (solution.point - 1.0), product
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        return self._solve(obs, gradient, 0.0)[0]
+        problem, sign = self._mirrored(obs, gradient, 0.0)
+        return sign * (problem.solve(0.0).point - 1.0)
 
     def gauge_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
         weight = self.weight(obs)

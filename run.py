@@ -78,6 +78,7 @@ def _paper_config(name: str, task: str) -> Config:
         env=task,
         robot=TASKS[task].robot.__name__,
         base=algorithm.base,
+        mapping=algorithm.mapping,
         frank_wolfe=issubclass(algorithm.agent, NFWPO),
         penalty=algorithm.penalty,
         steps=TASKS[task].steps,

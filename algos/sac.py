@@ -103,6 +103,7 @@ class SAC(Agent):
         self.critic_optimizer = adam(self.critic.parameters(), config.learning_rate)
         self.temperature_optimizer = adam(self.temperature.parameters(), config.learning_rate)
         self.target_entropy = -float(self.action_dim)
+        self.unit_ball = config.entropy == "ball"
         self.rollout_noise = torch.zeros(len(seeds), *self.actor.noise_shape)
         self.entropy: Tensor | None = None  # of the policy at the last batch's states
 
@@ -147,15 +148,17 @@ class SAC(Agent):
     def sample(self, obs: Tensor, center: Tensor | None, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """An action as the critic sees it, its log-density (seeds, batch), and the suggestion before the map."""
         raw, mean, std = self.actor.sample(obs, noise)
-        suggested = self.suggest(raw)
         if self.mapping == "alpha":
-            log_prob = self.constraint.alpha_log_prob(obs, raw, mean, std, center)
-            return self.feasible(obs, suggested, center), log_prob, suggested
+            ray = self.constraint.ray(obs, raw, center)
+            log_prob = ray.alpha_log_prob(mean, std, self.unit_ball, self.config.boundary_weight)
+            return ray.alpha_map(), log_prob, raw
         normal = -0.5 * ((raw - mean) / std).square() - std.log() - 0.5 * math.log(2 * math.pi)
         if self.mapping == "radial":
-            log_prob = self.constraint.radial_log_prob(obs, raw, normal.sum(-1), center)
-            return self.feasible(obs, suggested, center), log_prob, suggested
+            ray = self.constraint.ray(obs, raw, center)
+            log_prob = ray.radial_log_prob(normal.sum(-1), self.unit_ball, self.config.log_det_floor)
+            return ray.radial_map(), log_prob, raw
         log_slope = 2 * (math.log(2) - raw - softplus(-2 * raw))  # of tanh, exact however far out
+        suggested = self.suggest(raw)
         return suggested, (normal - log_slope).sum(-1), suggested
 
     def update(self, batch: Batch) -> None:

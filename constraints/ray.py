@@ -38,15 +38,32 @@ class Ray:
         # Near 0 the slope is only right to 1e-16 / L; it multiplies an offset of size L.
         return self._scaled(factor, (1.0 - tanh.square() - factor) / gauge)
 
-    def radial_log_prob(self, log_prob: Tensor) -> Tensor:
-        """Log-density (...) of `radial_map()`, given the log-density `log_prob` (...) of the action."""
-        gauge = differentiable_gauge(self.offset, self.gauge, self.gradient)
-        return (log_prob.double() - radial_log_det(gauge, self.offset.shape[-1])).to(log_prob.dtype)
+    def radial_log_prob(self, log_prob: Tensor, unit_ball: bool = False, floor: float = 0.0) -> Tensor:
+        """Log-density (...) of `radial_map()`, given the log-density `log_prob` (...) of the action.
 
-    def alpha_log_prob(self, mean: Tensor, std: Tensor) -> Tensor:
+        Args:
+            unit_ball: measure in unit-ball coordinates, see `log_reach`.
+            floor: added to the map's Jacobian determinant, whose exact value may be tiny, before the logarithm.
+        """
+        gauge = differentiable_gauge(self.offset, self.gauge, self.gradient)
+        log_det = radial_log_det(gauge, self.offset.shape[-1])
+        if floor > 0.0:
+            log_det = torch.logaddexp(log_det, log_det.new_tensor(math.log(floor)))
+        density = log_prob.double() - log_det
+        if unit_ball:
+            density = density + self.offset.shape[-1] * self.log_reach()
+        return density.to(log_prob.dtype)
+
+    def alpha_log_prob(
+        self, mean: Tensor, std: Tensor, unit_ball: bool = False, boundary_weight: float = 1.0
+    ) -> Tensor:
         """Log-density (...) of `alpha_map()` for an action from N(mean, diag std^2), each (..., d).
 
         With respect to volume where the action is feasible, to the boundary's surface measure where it is not.
+
+        Args:
+            unit_ball: measure volume and surface in unit-ball coordinates, see `log_reach`.
+            boundary_weight: weight of the surface measure beside the volume (paper, footnote on the entropy).
         """
         offset, mean, std = self.offset, mean.double(), std.double()
         residual = (self.action.double() - mean) / std
@@ -57,14 +74,27 @@ class Ray:
         gauge = differentiable_gauge(offset, self.gauge, self.gradient)
         to_boundary = torch.where(spread, 1.0, offset / torch.where(inside, 1.0, gauge).unsqueeze(-1))
         origin = torch.zeros_like(offset) if self.center is None else self.center.expand_as(offset)
+        # The boundary's element of surface is reach^d |grad L| times the unit sphere's. A gradient of length 1 here
+        # leaves the factor reach^d, which the interior needs as well.
+        normal = torch.full_like(offset, offset.shape[-1] ** -0.5) if unit_ball else self.gradient
         boundary = alpha_boundary_log_density(
-            to_boundary,
-            torch.where(spread, 1.0, self.gradient),
-            origin,
-            mean.expand_as(offset),
-            std.expand_as(offset),
+            to_boundary, torch.where(spread, 1.0, normal), origin, mean.expand_as(offset), std.expand_as(offset)
         )
-        return torch.where(inside, interior, boundary).to(self.action.dtype)
+        density = torch.where(inside, interior, boundary - math.log(boundary_weight))
+        if unit_ball:
+            density = density + offset.shape[-1] * self.log_reach()
+        return density.to(self.action.dtype)
+
+    def log_reach(self) -> Tensor:
+        """log r (...), with r = |v| / L the distance from the centre to the boundary along the ray; 0 at the centre.
+
+        In unit-ball coordinates y = L(v) v / |v| every set is the unit ball, whatever the state and the units:
+        entropies measured there mean the same everywhere. dy = dv / r^d, so the interior's log-density gains d log r.
+        """
+        gauge = differentiable_gauge(self.offset, self.gauge, self.gradient)
+        square = self.offset.square().sum(-1)
+        away = square > 0.0
+        return torch.where(away, square, 1.0).log() / 2.0 - torch.where(away, gauge, 1.0).log()
 
     def _scaled(self, factor: Tensor, slope: Tensor) -> Tensor:
         """c + factor (action - c), where the factor is a function of L with derivative `slope`."""

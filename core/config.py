@@ -42,6 +42,17 @@ class Config:
     target_noise: float | None = field(default=None, metadata={"help": "TD3, NFW: std of target smoothing"})
     target_noise_clip: float | None = field(default=None, metadata={"help": "TD3, NFW: bound of that noise"})
     penalty: float | None = field(default=None, metadata={"help": "names with +: weight of the penalty"})
+    # Choices that the paper leaves open or makes without naming them; its own are the defaults.
+    entropy: str | None = field(
+        default=None,
+        metadata={"help": "SAlpha, SRad: entropy of actions as in the 'paper', or in unit-'ball' coordinates"},
+    )
+    boundary_weight: float | None = field(
+        default=None, metadata={"help": "SAlpha: weight of the boundary's measure in the entropy"}
+    )
+    log_det_floor: float | None = field(
+        default=None, metadata={"help": "SRad: added to the determinant in the density (released code: 1e-6)"}
+    )
     # Protocol.
     eval_every: int = field(default=5_000, metadata={"help": "environment steps between evaluations"})
     eval_episodes: int = field(default=5, metadata={"help": "episodes of an evaluation"})
@@ -56,6 +67,11 @@ RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "threads")
 """Settings that do not make a run another experiment: they never show in a run's name."""
 
 TD3_CONSTANTS = {"policy_delay": 2, "target_noise": 0.2, "target_noise_clip": 0.5}
+
+ENTROPY_CHOICES: dict[str, dict] = {  # of SAC, by the map that its density has to follow
+    "alpha": {"entropy": "paper", "boundary_weight": 1.0},
+    "radial": {"entropy": "paper", "log_det_floor": 0.0},
+}
 
 HYPERPARAMETERS: dict[tuple[str, str], dict] = {
     # (robot, base algorithm): the paper's Table "Hyperparameters used in the experiments".
@@ -92,16 +108,21 @@ HYPERPARAMETERS: dict[tuple[str, str], dict] = {
 }  # fmt: skip
 
 
-def defaults(algo: str, env: str, robot: str, base: str, frank_wolfe: bool, penalty: bool, steps: int) -> Config:
+def defaults(
+    algo: str, env: str, robot: str, base: str, mapping: str, frank_wolfe: bool, penalty: bool, steps: int
+) -> Config:
     """The paper's configuration of one cell.
 
-    `robot` is the task's robot, `base` is "TD3" or "SAC"; `frank_wolfe` and `penalty` say whether the algorithm
-    takes Frank-Wolfe steps and has the penalty term; `steps` is the task's length of training.
+    `robot` is the task's robot, `base` is "TD3" or "SAC", `mapping` the algorithm's map; `frank_wolfe` and `penalty`
+    say whether the algorithm takes Frank-Wolfe steps and has the penalty term; `steps` is the task's length of
+    training.
     """
     group = robot if robot in ("Reacher", "Hopper") else "Others"
     table = dict(HYPERPARAMETERS[group, base])
     if base == "TD3":
         table |= TD3_CONSTANTS
+    else:
+        table |= ENTROPY_CHOICES.get(mapping, {})
     if not frank_wolfe:
         table.pop("fw_learning_rate", None)
     if penalty:
@@ -209,13 +230,15 @@ def _check_ranges(config: Config) -> None:
             demand(key, math.isfinite(value), "must be finite")
     for key in ("steps", "batch_size", "buffer_size", "eval_every", "eval_episodes", "final_episodes", "threads"):
         demand(key, getattr(config, key) >= 1, "must be at least 1")
-    for key in ("learning_starts", "action_noise", "target_noise", "target_noise_clip", "penalty"):
+    for key in ("learning_starts", "action_noise", "target_noise", "target_noise_clip", "penalty", "log_det_floor"):
         demand(key, (getattr(config, key) or 0) >= 0, "must not be negative")
     demand("gamma", 0 <= config.gamma <= 1, "must be in [0, 1]")
     demand("tau", 0 < config.tau <= 1, "must be in (0, 1]")
     demand("learning_rate", config.learning_rate > 0, "must be positive")
     demand("fw_learning_rate", 0 < (config.fw_learning_rate or 1.0) <= 1, "must be in (0, 1]")
     demand("policy_delay", (config.policy_delay or 1) >= 1, "must be at least 1")
+    demand("entropy", config.entropy in (None, "paper", "ball"), "must be 'paper' or 'ball'")
+    demand("boundary_weight", config.boundary_weight is None or config.boundary_weight > 0, "must be positive")
     demand("hidden", min(config.hidden) >= 1, "must list positive widths")
     demand("gradient_steps", config.gradient_steps == -1 or config.gradient_steps >= 1, "must be -1 or at least 1")
     freq = config.train_freq

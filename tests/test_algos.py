@@ -26,7 +26,14 @@ def make_agent(name, gsde=False, constraint=CONSTRAINT, seeds=SEEDS, **settings)
     """An agent with small networks whose outputs are not small, so that maps and clips all matter."""
     algorithm = ALGORITHMS[name]
     paper = defaults(
-        name, "W+M", "Reacher" if gsde else "Walker2d", algorithm.base, name == "NFW", algorithm.penalty, 1
+        algo=name,
+        env="W+M",
+        robot="Reacher" if gsde else "Walker2d",
+        base=algorithm.base,
+        mapping=algorithm.mapping,
+        frank_wolfe=name == "NFW",
+        penalty=algorithm.penalty,
+        steps=1,
     )
     settings = {"gamma": 0.9, "hidden": [8, 8], "tau": 0.1} | settings
     if algorithm.base == "TD3":

@@ -292,9 +292,18 @@ RADIAL_TOLERANCE = {1: 1e-9, 2: 1e-9, 3: 1e-5}
 ALPHA_TOLERANCE = 1e-9
 
 
+unit_ball_too = pytest.mark.parametrize("unit_ball", [False, True], ids=["actions", "unit ball"])
+
+
+def cone_content(direction: Tensor, du: Tensor, gauge: Tensor, unit_ball: bool) -> Tensor:
+    """d times the volume of each cone up to the boundary, in actions or in unit-ball coordinates."""
+    return (direction.norm(dim=-1) if unit_ball else gauge) ** -direction.shape[-1] * du
+
+
+@unit_ball_too
 @pytest.mark.parametrize("dim", [1, 2, 3])
 @pytest.mark.parametrize("name", SETS)
-def test_radial_density_integrates_to_one(name, dim):
+def test_radial_density_integrates_to_one(name, dim, unit_ball):
     constraint, center = feasible_sets(dim)[name]
     obs = observation(dim)
     mean, std = gaussian(dim)
@@ -303,14 +312,15 @@ def test_radial_density_integrates_to_one(name, dim):
     # The mapped action has gauge tanh(s); in s the density is smooth, and beyond 16 there is nothing.
     s, ds = (16.0 * x for x in radial_rule(32 if dim == 3 else 64))
     action = center + (s / gauge.unsqueeze(-1)).unsqueeze(-1) * direction.unsqueeze(-2)
-    log_prob = constraint.radial_log_prob(obs, action, normal_log_prob(action, mean, std), center)
-    volume = (s.tanh() ** (dim - 1) * s.cosh() ** -2 * ds) * (gauge**-dim * du).unsqueeze(-1)
+    log_prob = constraint.ray(obs, action, center).radial_log_prob(normal_log_prob(action, mean, std), unit_ball)
+    volume = (s.tanh() ** (dim - 1) * s.cosh() ** -2 * ds) * cone_content(direction, du, gauge, unit_ball).unsqueeze(-1)
     assert (log_prob.exp() * volume).sum().item() == pytest.approx(1.0, abs=RADIAL_TOLERANCE[dim])
 
 
+@unit_ball_too
 @pytest.mark.parametrize("dim", [1, 2, 3])
 @pytest.mark.parametrize("name", SETS)
-def test_alpha_interior_and_boundary_mass_sum_to_one(name, dim):
+def test_alpha_interior_and_boundary_mass_sum_to_one(name, dim, unit_ball):
     constraint, center = feasible_sets(dim)[name]
     obs = observation(dim)
     mean, std = gaussian(dim)
@@ -318,10 +328,13 @@ def test_alpha_interior_and_boundary_mass_sum_to_one(name, dim):
     gauge = constraint.gauge(obs, direction, center)
     level, dlevel = radial_rule(12)
     inside = center + (level / gauge.unsqueeze(-1)).unsqueeze(-1) * direction.unsqueeze(-2)
-    volume = (level ** (dim - 1) * dlevel) * (gauge**-dim * du).unsqueeze(-1)
-    interior = (constraint.alpha_log_prob(obs, inside, mean, std, center).exp() * volume).sum().item()
+    cones = cone_content(direction, du, gauge, unit_ball)
+    volume = (level ** (dim - 1) * dlevel) * cones.unsqueeze(-1)
+    density = constraint.ray(obs, inside, center).alpha_log_prob(mean, std, unit_ball).exp()
+    interior = (density * volume).sum().item()
     outside, area = surface_rule(constraint, obs, center, direction, du)
-    boundary = (constraint.alpha_log_prob(obs, outside, mean, std, center).exp() * area).sum().item()
+    density = constraint.ray(obs, outside, center).alpha_log_prob(mean, std, unit_ball).exp()
+    boundary = (density * (cones if unit_ball else area)).sum().item()
     assert 0.05 < interior < 0.95
     assert interior + boundary == pytest.approx(1.0, abs=ALPHA_TOLERANCE)
 
@@ -405,7 +418,56 @@ def test_alpha_density_matches_a_histogram_of_mapped_samples(name):
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_gradients_through_reparametrised_sampling(name):
+def test_unit_ball_density_is_that_of_the_coordinates(name):
+    """In six dimensions, where integrals are out of reach: against the Jacobian of y = L(v) v / |v| by autograd."""
+    dim = 6
+    constraint, center = feasible_sets(dim)[name]
+    obs = observation(dim)
+    generator = torch.Generator().manual_seed(7)
+    action = center + 0.3 * torch.randn(5, dim, dtype=torch.float64, generator=generator)
+    log_prob = constraint.ray(obs, action, center).radial_log_prob(torch.zeros(5, dtype=torch.float64), unit_ball=True)
+
+    def coordinates(action: Tensor) -> Tensor:
+        offset = constraint.radial_map(obs, action, center) - center
+        return constraint.gauge(obs, offset, center) * offset / offset.norm()
+
+    for k in range(5):
+        jacobian = torch.autograd.functional.jacobian(coordinates, action[k])
+        assert -log_prob[k].item() == pytest.approx(torch.linalg.slogdet(jacobian).logabsdet.item(), abs=1e-9)
+
+
+def test_log_reach_at_the_center_is_finite():
+    constraint, center = feasible_sets(3)["ball"]
+    action = center.clone().requires_grad_()
+    reach = constraint.ray(observation(3), action, center).log_reach()
+    (gradient,) = torch.autograd.grad(reach, action)
+    assert reach.item() == 0.0
+    assert torch.equal(gradient, torch.zeros(3, dtype=torch.float64))
+
+
+def test_floor_is_added_to_the_determinant():
+    constraint, center = feasible_sets(3)["positive part"]
+    action = center + torch.linspace(0.0, 12.0, 30, dtype=torch.float64).unsqueeze(-1) * gaussian(3)[1]
+    ray = constraint.ray(observation(3), action, center)
+    zero = torch.zeros(30, dtype=torch.float64)
+    expected = -torch.log((-ray.radial_log_prob(zero)).exp() + 1e-6)
+    torch.testing.assert_close(ray.radial_log_prob(zero, floor=1e-6), expected)
+
+
+def test_boundary_weight_scales_the_boundary_s_measure_alone():
+    constraint, center = feasible_sets(3)["ball"]
+    mean, std = gaussian(3)
+    action = center + torch.linspace(0.1, 3.0, 20, dtype=torch.float64).unsqueeze(-1) * std
+    ray = constraint.ray(observation(3), action, center)
+    gain = ray.alpha_log_prob(mean, std) - ray.alpha_log_prob(mean, std, boundary_weight=5.0)
+    outside = ray.gauge > 1.0
+    assert 0 < outside.sum() < 20
+    torch.testing.assert_close(gain, math.log(5.0) * outside.double())
+
+
+@unit_ball_too
+@pytest.mark.parametrize("name", SETS)
+def test_gradients_through_reparametrised_sampling(name, unit_ball):
     dim = 3
     constraint, center = feasible_sets(dim)[name]
     obs = observation(dim)
@@ -414,11 +476,11 @@ def test_gradients_through_reparametrised_sampling(name):
     mean, std = (x.expand(24, dim).clone().requires_grad_() for x in gaussian(dim))
 
     def alpha(mean: Tensor, std: Tensor) -> Tensor:
-        return constraint.alpha_log_prob(obs, mean + std * noise, mean, std, center)
+        return constraint.ray(obs, mean + std * noise, center).alpha_log_prob(mean, std, unit_ball)
 
     def radial(mean: Tensor, std: Tensor) -> Tensor:
         action = mean + std * noise
-        return constraint.radial_log_prob(obs, action, normal_log_prob(action, mean, std), center)
+        return constraint.ray(obs, action, center).radial_log_prob(normal_log_prob(action, mean, std), unit_ball)
 
     infeasible = constraint.gauge(obs, mean + std * noise - center, center) > 1.0
     assert infeasible.any()

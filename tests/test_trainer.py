@@ -283,7 +283,9 @@ def test_stored_transitions(tmp_path, train_freq):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_the_buffer_has_suggestions_where_the_environment_maps_and_executed_actions_elsewhere(tmp_path, name):
     algorithm = ALGORITHMS[name]
-    config = defaults(name, "Scripted", "Hopper", algorithm.base, name == "NFW", algorithm.penalty, steps=40)
+    config = defaults(
+        name, "Scripted", "Hopper", algorithm.base, algorithm.mapping, name == "NFW", algorithm.penalty, steps=40
+    )
     config.hidden, config.learning_starts, config.batch_size, config.eval_every = [8, 8], 20, 4, 40
     config.eval_episodes = config.final_episodes = 1
     if config.action_noise:

@@ -48,7 +48,7 @@ class Ray:
         gauge = differentiable_gauge(self.offset, self.gauge, self.gradient)
         log_det = radial_log_det(gauge, self.offset.shape[-1])
         if floor > 0.0:
-            log_det = torch.logaddexp(log_det, log_det.new_tensor(math.log(floor)))
+            log_det = torch.logaddexp(log_det, torch.full_like(log_det, math.log(floor)))
         density = log_prob.double() - log_det
         if unit_ball:
             density = density + self.offset.shape[-1] * self.log_reach()

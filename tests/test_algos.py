@@ -336,6 +336,31 @@ def test_the_temperature_rises_for_too_little_entropy_and_falls_for_too_much(nam
     assert change[0] > 0 > change[1]
 
 
+@pytest.mark.parametrize(
+    "name, settings, options",
+    [
+        ("SRad", {"entropy": "ball"}, {"unit_ball": True}),
+        ("SRad", {"log_det_floor": 1e-2}, {"floor": 1e-2}),
+        ("SAlpha", {"entropy": "ball"}, {"unit_ball": True}),
+        ("SAlpha", {"boundary_weight": 3.0}, {"boundary_weight": 3.0}),
+    ],
+)
+def test_choices_of_entropy_change_the_density_and_nothing_else(name, settings, options):
+    batch, noise = make_batch(), torch.randn(len(SEEDS), BATCH, DIM, generator=torch.Generator().manual_seed(1))
+    plain = make_agent(name).sample(batch.obs, batch.center, noise)
+    agent = make_agent(name, **settings)
+    action, log_prob, suggested = agent.sample(batch.obs, batch.center, noise)
+    assert torch.equal(action, plain[0]) and torch.equal(suggested, plain[2])
+    ray = CONSTRAINT.ray(batch.obs, suggested, batch.center)
+    mean, std = agent.actor(batch.obs)
+    if name == "SRad":
+        expected = ray.radial_log_prob(Normal(mean, std).log_prob(suggested).sum(-1), **options)
+    else:
+        expected = ray.alpha_log_prob(mean, std, **options)
+    torch.testing.assert_close(log_prob, expected)
+    assert not torch.allclose(log_prob, plain[1])
+
+
 def test_the_temperature_starts_at_one_for_every_seed():
     agent = ALGORITHMS["SPre"].agent(
         make_agent("SPre").config, CONSTRAINT, OBS, SEEDS, mapping="project", placement="environment"

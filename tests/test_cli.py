@@ -70,6 +70,11 @@ def test_usage_names_every_algorithm_task_and_key(capsys, arguments):
         ("algo=SRad env=W+M action_noise=0.1", "does not apply to SRad"),
         ("algo=DPre env=W+M penalty=2", "does not apply to DPre"),
         ("algo=DPre env=W+M fw_learning_rate=0.1", "does not apply to DPre"),
+        ("algo=SRad env=W+M entropy=disc", "bad value 'disc' for entropy: must be 'paper' or 'ball'"),
+        ("algo=SRad env=W+M boundary_weight=2", "does not apply to SRad"),
+        ("algo=SAlpha env=W+M boundary_weight=0", "must be positive"),
+        ("algo=SRad env=W+M log_det_floor=-1", "must not be negative"),
+        ("algo=SPre env=W+M entropy=ball", "does not apply to SPre"),
         ("algo=SRad env=W+M overwrite=maybe", "bad value 'maybe' for overwrite"),
     ],
 )

@@ -2,6 +2,7 @@
 
     python bench/constraints.py                                          # all tasks, batches and installed solvers
     python bench/constraints.py task=W+M,HC+O batch=1,100 baselines=osqp,linprog out=results/bench
+    python bench/constraints.py baselines=none                           # this package alone
 
 Prints a table and saves it in `out` (default bench/results) as constraints.md and, one measurement a row, as
 constraints.csv.
@@ -33,7 +34,6 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 from scipy import sparse
 from scipy.optimize import linprog
 from torch import Tensor
@@ -48,6 +48,7 @@ from constraints import (
     WeightedL1AndEllipse,
     WeightedPositivePart,
 )
+from core.config import ConfigError, choose, split_names
 from envs import TASKS
 from envs.reacher import Reacher
 
@@ -329,20 +330,32 @@ def table(records: list[dict], batches: list[int]) -> str:
     return "\n".join(f"| {line} |" for line in lines)
 
 
-def main(arguments: list[str]) -> None:
-    defaults = {
-        "task": ",".join(TASKS),
-        "batch": "1,16,100,256,2560",
-        "baselines": ",".join(BASELINES),
-        "out": "bench/results",
-    }
-    config = OmegaConf.create(defaults)
-    OmegaConf.set_struct(config, True)
-    config = OmegaConf.merge(config, OmegaConf.from_dotlist(arguments))
+def choices(arguments: list[str]) -> tuple[list[str], list[int], list[str], Path]:
+    """Tasks, batch sizes, baselines and the folder that the `key=value` words ask for; ConfigError for a wrong one."""
+    known = {"task": "all", "batch": "1,16,100,256,2560", "baselines": "all", "out": "bench/results"}
+    for word in arguments:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise ConfigError(f"expected key=value, got {word!r}")
+        known[choose("key", key, known)] = value
+    batches = known["batch"].split(",")
+    if not all(batch.isdecimal() and int(batch) > 0 for batch in batches):
+        raise ConfigError(f"bad batch {known['batch']!r} (example: batch=1,100)")
+    names = known["baselines"]
+    solvers = split_names("baseline", names, BASELINES) if names not in ("", "none") else []
+    return split_names("task", known["task"], TASKS), [int(batch) for batch in batches], solvers, Path(known["out"])
+
+
+def main(arguments: list[str]) -> int:
+    """Exit code: 0 done, 2 bad input."""
+    try:
+        tasks, batches, wanted, out = choices(arguments)
+    except ConfigError as error:
+        print(f"bench/constraints.py: {error}", file=sys.stderr)
+        return 2
     torch.set_num_threads(1)
-    tasks, batches = str(config.task).split(","), [int(b) for b in str(config.batch).split(",")]
     solvers = []
-    for name in filter(None, str(config.baselines).split(",")):
+    for name in wanted:
         if importlib.util.find_spec(MODULES[name]) is None:
             print(f"{name} is not installed: left out")
         else:
@@ -353,14 +366,14 @@ def main(arguments: list[str]) -> None:
         "`active`: share of the actions that are infeasible.\n\n" + table(records, batches) + "\n"
     )
     print(text)
-    out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
     (out / "constraints.md").write_text(text)
     with open(out / "constraints.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, list(records[0]))
         writer.writeheader()
         writer.writerows(records)
+    return 0
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

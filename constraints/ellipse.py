@@ -222,12 +222,12 @@ def minimize_in_ellipse(
 ) -> tuple[Tensor, JacobianProduct]:
     """Minimiser (..., d) of sum(shift a^2 / 2 - target a) over a problem's set, which mirrors the target, and
     sum(scale a^2) <= bound; and the product with its Jacobian in the target."""
-    solution, metric, mu = minimize_under_ellipse(problem, shift, scale, bound)
-    point = torch.copysign(within_ellipse(solution.point, scale * solution.point, bound), target)
+    point, solution, mu = minimize_under_ellipse(problem, shift, scale, bound)
+    point = torch.copysign(within_ellipse(point, scale * point, bound), target)
 
     def product(vector: Tensor) -> Tensor:
-        normal = scale * point * (mu > 0.0)
-        return deflated_jacobian(solution.moves() / metric, torch.copysign(solution.row(), target), normal)(vector)
+        curvature = solution.moves() / (mu * scale + shift)
+        return deflated_jacobian(curvature, torch.copysign(solution.row(), target), scale * point * (mu > 0.0))(vector)
 
     return point, product
 

@@ -14,6 +14,7 @@ from torch import Tensor
 _TINY = 1e-300
 _HUGE = 1e100
 _LEAST_WEIGHT = 1e-30  # counts as 0 but keeps quotients finite
+_LEAST_METRIC = 1e-150  # of a coordinate that jumps; squares of its inverse stay finite
 _JUST_BELOW = 1.0 - 2.0**-52
 # Newton needs 3 to 10 steps, rows with tied or degenerate gradients up to 30.
 _MAX_STEPS = 40
@@ -111,11 +112,12 @@ class BoxSolution(NamedTuple):
 
 def minimize_under_ellipse(
     problem: RowProblem | BoxProblem, shift: float, scale: Tensor, bound: float
-) -> tuple[RowSolution | BoxSolution, Tensor, Tensor]:
+) -> tuple[Tensor, RowSolution | BoxSolution, Tensor]:
     """Minimiser of sum(shift a^2 / 2 - target a) over the problem's set and sum(scale a^2) <= bound.
 
-    scale (..., d) >= 0, target >= 0. It is the problem's solution for the metric shift + mu scale: returns that
-    solution, the metric (..., d) and the ellipse's multiplier mu (..., 1), 0 where it does not hold the solution back.
+    scale (..., d) >= 0, target >= 0. It is the problem's solution for the metric shift + mu scale. Returns the
+    minimiser (..., d), that solution, which says what holds the minimiser, and the ellipse's multiplier mu (..., 1),
+    0 where the ellipse does not.
 
     The dual function is concave in mu, so the ellipse's value falls along mu: Newton's method on 1 / sqrt(value of the
     free coordinates), which is linear in mu for a sphere, within a bracket. Since scale_i a_i <= target_i / mu, the
@@ -139,18 +141,19 @@ def minimize_under_ellipse(
         low, high = torch.where(over, mu, low), torch.where(over, high, mu)
 
         free = (point > 0.0) & (point < 1.0)
-        softness = free / metric.clamp_(min=_TINY)
-        bend = softness * pull
-        stiffness = (softness * row.square()).sum(-1, keepdim=True).clamp_(min=_TINY)
-        tilt = (bend * row).sum(-1, keepdim=True).div_(stiffness)  # of the row's multiplier along mu
-        fall = (bend * (pull - tilt * row)).sum(-1, keepdim=True)
+        softness = free / metric.clamp_(min=_LEAST_METRIC)
+        soft_row = softness * row
+        tilt = (soft_row * pull).sum(-1, keepdim=True) / (soft_row * row).sum(-1, keepdim=True).clamp_(min=_TINY)
+        fall = softness * (pull - tilt * row)  # of the point along mu, with the row's multiplier
         moving = (energy * free).sum(-1, keepdim=True)
-        newton = mu + moving / fall * ((moving / (moving - excess)).sqrt_() - 1.0)
+        rate = moving / (fall * pull).sum(-1, keepdim=True)
+        newton = torch.addcmul(mu, rate, (moving / (moving - excess)).sqrt_() - 1.0)
         middle = (torch.maximum(low, torch.minimum(floor, 1e-3 * high)) * high).sqrt_()
         unsettled = (excess.abs() > _SETTLED * bound) & (high > 0.0)
-        mu = torch.where((newton > low) & (newton < high), newton, torch.where(unsettled, middle, mu))
+        following = torch.where((newton > low) & (newton < high), newton, torch.where(unsettled, middle, mu))
+        step, mu = following - mu, following
         # Asking a GPU would cost more than it saves, and a graph cannot be captured with the question.
         if target.is_cpu and not unsettled.any():
             break
-    metric = mu * scale + shift
-    return problem.solve(metric), metric, mu
+    # The last step is so small that its first order is exact.
+    return (point - step * fall).clamp_(0.0, 1.0), solution, mu

@@ -92,11 +92,12 @@ class PlanarEllipse(Constraint):
         in_box = on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + _ROUNDING
 
         # The best point of a face, mirrored to a_i = 1, is that of its interval nearest to the other coordinate.
+        # Squared distances are compared without |action|^2, beside which those of a far point would be equal.
         own, other = _mirrored(action), _mirrored(action.flip(-1))
         low, high, met = planar.faces()
         moved = torch.minimum(torch.maximum(other, low), high)
-        distance = (own - 1.0).square() + (other - moved).square()
-        face = distance.masked_fill(~met, torch.inf).flatten(-2).argmin(-1, keepdim=True)
+        nearness = moved * (moved - 2.0 * other) - 2.0 * own
+        face = nearness.masked_fill(~met, torch.inf).flatten(-2).argmin(-1, keepdim=True)
         on_face = _on_face(face, moved.flatten(-2).gather(-1, face))
         slides = ((moved > low) & (moved < high)).flatten(-2).gather(-1, face)
 

@@ -15,6 +15,7 @@ _TINY = 1e-300
 _HUGE = 1e100
 _LEAST_WEIGHT = 1e-30  # counts as 0 but keeps quotients finite
 _LEAST_METRIC = 1e-150  # of a coordinate that jumps; squares of its inverse stay finite
+_LEAST_MULTIPLIER = 1e-100
 _JUST_BELOW = 1.0 - 2.0**-52
 # Newton needs 3 to 10 steps, rows with tied or degenerate gradients up to 30.
 _MAX_STEPS = 40
@@ -150,10 +151,21 @@ def minimize_under_ellipse(
         newton = torch.addcmul(mu, rate, (moving / (moving - excess)).sqrt_() - 1.0)
         middle = (torch.maximum(low, torch.minimum(floor, 1e-3 * high)) * high).sqrt_()
         unsettled = (excess.abs() > _SETTLED * bound) & (high > 0.0)
-        following = torch.where((newton > low) & (newton < high), newton, torch.where(unsettled, middle, mu))
-        step, mu = following - mu, following
+        # From mu = 0 a jump has no slope: what Newton makes of it is next to 0.
+        better = (newton > low + _LEAST_MULTIPLIER) & (newton < high)
+        following = torch.where(better, newton, torch.where(unsettled, middle, mu))
+        step, mu = (following - mu).masked_fill(unsettled, 0.0), following
         # Asking a GPU would cost more than it saves, and a graph cannot be captured with the question.
         if target.is_cpu and not unsettled.any():
             break
     # The last step is so small that its first order is exact.
-    return (point - step * fall).clamp_(0.0, 1.0), solution, mu
+    point = (point - step * fall).clamp_(0.0, 1.0)
+    if not target.is_cpu or unsettled.any():
+        # The value jumps over the bound, where the gradient of an oracle ties with the row: between the two sides.
+        start, end = (problem.solve(multiplier * scale + shift).point for multiplier in (low, high))
+        way = start - end
+        lean, size = (scale * end * way).sum(-1, keepdim=True), (scale * way.square()).sum(-1, keepdim=True)
+        slack = (bound - (scale * end.square()).sum(-1, keepdim=True)).clamp_(min=0.0)
+        share = slack / (lean + (lean.square() + size * slack).sqrt_()).clamp_(min=_TINY)
+        point = torch.where(unsettled, end + share.clamp_(0.0, 1.0) * way, point)
+    return point, solution, mu

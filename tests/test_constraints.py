@@ -206,6 +206,23 @@ def test_center_is_chebyshev_s_or_the_origin(task):
         assert -reference.violation(center[k].numpy()) == pytest.approx(reference.chebyshev_radius(), abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    "w, s, gradient",
+    [
+        ([2.0, 1.0], [1.0, 1.0], [0.2, 0.1]),  # the ellipse holds the oracle, the row does not
+        ([1.5, 3.0], [0.0, 3.0], [0.15, 0.3]),  # the ellipse has no word on the first coordinate
+        ([1.3125, 3.0], [1.0, 1.0], [0.13125, 0.3]),  # the ratios tie but for a rounding
+        ([1.0, 1.0], [0.0, 1.0], [0.1, 0.1]),
+    ],
+)
+def test_oracle_where_the_gradient_ties_with_the_row(w, s, gradient):
+    constraint = WeightedL1AndEllipse(velocities, 1.0, lambda obs: angles(obs).square(), 0.1, 2)
+    reference = ReferenceSet(sign_rows(np.array(w)), np.ones(4), np.diag(np.square(s)), 0.1)
+    best = constraint.linear_oracle(torch.tensor(w + s).double(), torch.tensor(gradient).double()).numpy()
+    assert reference.violation(best) <= 1e-12
+    assert gradient @ best == pytest.approx(gradient @ reference.linear_oracle(np.array(gradient)), abs=1e-9)
+
+
 # ------------------------------------------------------------------------------------------ gauge and the maps
 
 

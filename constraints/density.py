@@ -69,7 +69,9 @@ def _quadrature(device: torch.device) -> tuple[Tensor, Tensor]:
     return torch.as_tensor((nodes + 1) / 2, device=device), torch.as_tensor(weights / 2, device=device)
 
 
-def log_ray_integral(slope: Tensor, intercept: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+def log_ray_integral(
+    slope: Tensor, intercept: Tensor, dim: int, derivatives: bool = True
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """log I(A, B), I = integral from 1 to infinity of t^(d-1) exp(-(A t + B)^2) dt, and its two derivatives.
 
     Gauss-Legendre quadrature on a window around the mode that holds all but e^-25 of the integrand, whatever
@@ -78,8 +80,9 @@ def log_ray_integral(slope: Tensor, intercept: Tensor, dim: int) -> tuple[Tensor
     Args:
         slope, intercept: (...) A > 0 and B, float64.
         dim: d >= 1.
+        derivatives: whether they are wanted.
     Returns:
-        (...) each: log I, d log I / dA, d log I / dB. Outside autograd.
+        (...) each: log I, d log I / dA, d log I / dB, or None for both. Outside autograd.
     """
     # In w = A t, the log of the integrand is h(w) = k log(w / A) - (w + B)^2 on w >= A: concave (k = d - 1).
     k = dim - 1
@@ -105,10 +108,12 @@ def log_ray_integral(slope: Tensor, intercept: Tensor, dim: int) -> tuple[Tensor
     ratio = r.add_(1)  # t over its value at the mode
     lower = ratio.log().mul_(k - 1).sub_(gauss).exp_()  # the integrand with t^(d-2), then with t^(d-1)
     mass = (lower * ratio) @ weights * width
-    mean_inverse = lower @ weights * width / (mode * mass)  # E[1 / (A t)]
 
     rise = k * torch.log(mode / slope)
     log_integral = rise - at_mode.square() + torch.log(mass * (mode / slope))
+    if not derivatives:
+        return log_integral, None, None
+    mean_inverse = lower @ weights * width / (mode * mass)  # E[1 / (A t)]
     # Integration by parts makes both derivatives sums of one sign; differences of moments would cancel:
     # -d/dA = (e / I + d) / A and -d/dB = (e / I + (d - 1) E[1 / t]) / A, with e = exp(-(A + B)^2).
     edge = torch.exp((mode - slope) * (at_mode + slope + intercept) - rise) / (mass * mode)  # e / (A I)
@@ -128,7 +133,8 @@ class _AlphaBoundaryLogDensity(torch.autograd.Function):
         foot = (start * ray).sum(-1, keepdim=True) / square
         residual = start - foot * ray
         slope = torch.sqrt(square / 2)
-        log_integral, by_slope, by_intercept = log_ray_integral(slope[..., 0], (slope * foot)[..., 0], dim)
+        derivatives = any(ctx.needs_input_grad)
+        log_integral, by_slope, by_intercept = log_ray_integral(slope[..., 0], (slope * foot)[..., 0], dim, derivatives)
         normal_square = normal.square().sum(-1)
         ctx.save_for_backward(normal, normal_square, std, ray, foot, residual, slope, by_slope, by_intercept)
         per_axis = residual.square() / 2 + std.log() + 0.5 * math.log(2 * math.pi)

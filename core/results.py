@@ -198,6 +198,8 @@ class Run:
     seed: int
     config: dict[str, Any]
     evaluations: Evaluations
+    training: dict[str, np.ndarray]
+    """Columns of training.csv, each (m,), the first called `step`; empty where the run has none."""
     result: dict[str, Any] | None
 
     @property
@@ -230,6 +232,7 @@ def read_run(folder: str | Path) -> Run:
         seed=int(folder.name.removeprefix("seed=")),
         config=_parse(folder / "config.yaml", lambda text: yaml.load(text, _YamlLoader)),
         evaluations=_read_evaluations(folder / "evaluations.csv"),
+        training=_read_training(folder / "training.csv"),
         result=result,
     )
 
@@ -262,19 +265,35 @@ def _parse(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
 
 
 def _read_evaluations(path: Path) -> Evaluations:
+    columns, table = _read_rows(path)
+    if len(columns) < 3 or (columns[0], columns[1], columns[-1]) != ("step", "return_mean", "seconds"):
+        raise ValueError(f"{path}: not the header of an evaluations file")
+    return Evaluations(table[:, 0].astype(np.int64), table[:, 1], table[:, 2:-1], table[:, -1])
+
+
+def _read_training(path: Path) -> dict[str, np.ndarray]:
+    if not path.exists():
+        return {}
+    columns, table = _read_rows(path)
+    if columns == [""]:  # made at this moment, its header not written yet
+        return {}
+    if columns[0] != "step":
+        raise ValueError(f"{path}: not the header of a training file")
+    return dict(zip(columns, table.T, strict=True))
+
+
+def _read_rows(path: Path) -> tuple[list[str], np.ndarray]:
+    """The header of a CSV file of numbers, and its rows (n, columns)."""
     try:
         header, *lines = path.read_text().split("\n")
         columns = header.split(",")
-        if len(columns) < 3 or (columns[0], columns[1], columns[-1]) != ("step", "return_mean", "seconds"):
-            raise ValueError("not the header of an evaluations file")
         # What follows the last line end is empty, or a row being written at this moment.
         rows = [[float(x) for x in line.split(",")] for line in lines[:-1]]
         if any(len(row) != len(columns) for row in rows):
             raise ValueError("a row does not have the header's number of columns")
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: {_reason(error)}") from error
-    table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
-    return Evaluations(table[:, 0].astype(np.int64), table[:, 1], table[:, 2:-1], table[:, -1])
+    return columns, np.array(rows, dtype=np.float64).reshape(-1, len(columns))
 
 
 def _reason(error: Exception) -> str:

@@ -1,0 +1,66 @@
+"""The paper's tables of tasks and of hyperparameters, made from the definitions that the code runs with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from itertools import groupby
+from typing import Any
+
+from core.config import HYPERPARAMETERS, RUN_KEYS, Config, defaults
+from envs.tasks import TASKS, Task
+from plots.tables import MISSING, Cell, Table, text_cells
+
+
+def task_table(tasks: Mapping[str, Task] = TASKS) -> Table:
+    """The paper's Table "Experiment environments and constraints", with the steps of training."""
+    sections, records = [], []
+    for robot, names in groupby(tasks, lambda name: tasks[name].robot.__name__):
+        rows: list[list[Cell]] = []
+        for name in names:
+            task = tasks[name]
+            dim = task.constraint.dim
+            cells = text_cells("" if rows else f"{robot} (d = {dim})", name, task.description, f"{task.steps:,}")
+            cells[2] = cells[2]._replace(tex=f"${task.formula}$")
+            rows.append(cells)
+            record = {"task": name, "robot": robot, "action_dim": dim, "steps": task.steps}
+            records.append(record | {"description": task.description, "formula": task.formula})
+        sections.append(rows)
+    title = "Tasks: robot, additional constraint (the box [-1, 1]^d always holds as well), environment steps of a run"
+    return Table("tasks", title, ["Environment", "Task", "Constraint", "Steps"], 3, sections, records)
+
+
+def hyperparameter_table() -> Table:
+    """The paper's Table "Hyperparameters used in the experiments", then the constants that it leaves to its sources."""
+    columns = {group: _configuration(*group) for group in HYPERPARAMETERS}
+    in_paper = {key for settings in HYPERPARAMETERS.values() for key in settings}
+    published: list[list[Cell]] = []
+    further: list[list[Cell]] = []
+    records = []
+    for setting in fields(Config):
+        key = setting.name
+        values = [config[key] for config in columns.values()]
+        if key in (*RUN_KEYS, "steps") or all(value is None for value in values):
+            continue
+        row = text_cells(key, setting.metadata["help"], *(_text(value) for value in values))
+        (published if key in in_paper else further).append(row)
+        for (robot, base), value in zip(columns, values, strict=True):
+            records.append({"setting": key, "robot": robot, "base": base, "value": value})
+    header = ["Setting", "Meaning", *(f"{robot} {base}" for robot, base in columns)]
+    spans = {robot: len(list(group)) for robot, group in groupby(robot for robot, _ in columns)}
+    title = "Hyperparameters of the paper's table, then constants and protocol"
+    return Table("hyperparameters", title, header, 2, [published, further], records, spans)
+
+
+def _configuration(robot: str, base: str) -> dict[str, Any]:
+    """The settings on `robot` of an algorithm that has all of its base's."""
+    config = defaults(algo="", env="", robot=robot, base=base, frank_wolfe=base == "TD3", penalty=True, steps=0)
+    return asdict(config)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return MISSING
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)

@@ -1,0 +1,145 @@
+"""Which runs belong together: those whose configurations differ in nothing but the seed."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from core.config import RUN_KEYS
+from core.results import Run
+from plots.paper import Statistic, order_algos, order_tasks
+
+
+class Condition(NamedTuple):
+    """A row of the tables: a task and the settings that differ from the paper's, as `key=value, ...`."""
+
+    task: str
+    settings: str
+
+    @property
+    def label(self) -> str:
+        return ", ".join(filter(None, self))
+
+
+Groups = dict[Condition, dict[str, list[Run]]]
+"""Runs by condition and algorithm: those of one group differ in nothing but the seed."""
+
+
+@dataclass
+class _Group:
+    """Runs of one configuration; `settings` is what tells it from the others in its label."""
+
+    task: str
+    algo: str
+    config: dict[str, Any]
+    settings: dict[str, str]
+    runs: dict[int, Run]
+
+
+def group_runs(runs: Iterable[Run]) -> tuple[Groups, list[str]]:
+    """Group the runs that differ in nothing but the seed; also a line for each that repeats another's seed.
+
+    Usually a run's folder name tells what is special about it. Where configurations of one label differ all the
+    same (defaults that changed between the runs, say), their labels name the settings that do.
+    """
+    groups: dict[tuple[str, str, str], _Group] = {}
+    repeated = []
+    for run in runs:
+        config = {key: value for key, value in run.config.items() if key not in RUN_KEYS}
+        key = run.task, run.algo, json.dumps(config, sort_keys=True, default=str)
+        group = groups.setdefault(key, _Group(run.task, run.algo, config, dict(run.overrides), {}))
+        first = group.runs.setdefault(run.seed, run)
+        if first is not run:
+            repeated.append(f"{run.folder}: the same configuration and seed as {first.folder}")
+    _tell_apart(list(groups.values()))
+    result: Groups = defaultdict(dict)
+    for group in groups.values():
+        settings = ", ".join(f"{key}={value}" for key, value in sorted(group.settings.items()))
+        result[Condition(group.task, settings)][group.algo] = [group.runs[seed] for seed in sorted(group.runs)]
+    return dict(result), repeated
+
+
+def _tell_apart(groups: Sequence[_Group]) -> None:
+    """Add settings to groups of the same label until no two labels are the same."""
+    while True:
+        same_label = defaultdict(list)
+        for group in groups:
+            same_label[group.task, group.algo, tuple(sorted(group.settings.items()))].append(group)
+        alike = [members for members in same_label.values() if len(members) > 1]
+        if not alike:
+            return
+        for members in alike:
+            first, *others = [member.config for member in members]
+            keys = {key for config in (first, *others) for key in config}
+            for key in keys:
+                if any(other.get(key) != first.get(key) for other in others):
+                    for member in members:
+                        member.settings[key] = _text(member.config.get(key))
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+
+
+def order_conditions(conditions: Iterable[Condition]) -> list[list[Condition]]:
+    """Sections of rows: the paper's own settings first, then one section for each other combination."""
+    by_settings: dict[str, list[str]] = defaultdict(list)
+    for task, settings in conditions:
+        by_settings[settings].append(task)
+    return [
+        [Condition(task, settings) for task in order_tasks(tasks)] for settings, tasks in sorted(by_settings.items())
+    ]
+
+
+def final_return(run: Run) -> float | None:
+    """The mean return that the run ended with: None while it is unfinished, not finite if it failed."""
+    return None if run.result is None else float(run.result["return_mean"])
+
+
+def statistic(values: Sequence[float]) -> Statistic:
+    array = np.asarray(values, dtype=np.float64)
+    n = len(array)
+    return Statistic(float(array.mean()), float(array.std(ddof=1) / math.sqrt(n)) if n > 1 else math.nan, n)
+
+
+def reward_statistics(groups: Groups) -> dict[Condition, dict[str, Statistic]]:
+    """Statistics over the finite results of each cell; cells and rows without any are left out."""
+    statistics: dict[Condition, dict[str, Statistic]] = {}
+    for condition, by_algo in groups.items():
+        for algo, runs in by_algo.items():
+            returns = [value for run in runs if (value := final_return(run)) is not None and math.isfinite(value)]
+            if returns:
+                statistics.setdefault(condition, {})[algo] = statistic(returns)
+    return statistics
+
+
+def list_left_out(groups: Groups) -> list[str]:
+    """A line for each cell with runs that are in progress, were interrupted, or failed."""
+    lines = []
+    for condition in chain.from_iterable(order_conditions(groups)):
+        for algo in order_algos(groups[condition]):
+            runs = groups[condition][algo]
+            if unfinished := [run for run in runs if not run.finished]:
+                reached = [run.evaluations.step.max(initial=0) for run in unfinished]
+                span = " to ".join(f"{step:,}" for step in sorted({min(reached), max(reached)}))
+                total = unfinished[0].config.get("steps")
+                of = f" of {total:,}" if isinstance(total, int) else ""
+                lines.append(f"{condition.label} {algo}: seed {_seeds(unfinished)}, evaluated to step {span}{of}")
+            if failed := [run for run in runs if run.finished and not math.isfinite(final_return(run))]:
+                lines.append(f"{condition.label} {algo}: seed {_seeds(failed)} failed, its return is not a number")
+    return lines
+
+
+def count_failed(runs: Iterable[Run]) -> int:
+    return Counter(run.finished and not math.isfinite(final_return(run)) for run in runs)[True]
+
+
+def _seeds(runs: Iterable[Run]) -> str:
+    return ", ".join(str(run.seed) for run in runs)

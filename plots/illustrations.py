@@ -1,0 +1,188 @@
+"""Pictures of feasible sets: the paper's Figure 1, and the actions that a trained policy executes in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from torch import Tensor
+
+import envs
+from algos import ALGORITHMS
+from constraints import Constraint, LinearConstraint
+from core.config import Config, ConfigError
+from core.random import stream_seed
+from core.results import Run, read_run
+from plots.paper import order_tasks
+from plots.style import plain, save
+
+SET_COLOR, POINT_COLORS = "#cfe0f3", ("#b8520a", "#1e6b26")
+PANELS = 8
+"""Moments of an episode at which the feasible set is drawn."""
+
+
+def polygon() -> LinearConstraint:
+    """The feasible set of the figure of maps."""
+    rows = [[0.0, -1.0], [0.9, -0.45], [0.75, 0.65], [-0.35, 0.94], [-1.0, 0.1]]
+    bounds = [0.62, 0.68, 0.62, 0.6, 0.72]
+    A, b = torch.tensor(rows, dtype=torch.float64), torch.tensor(bounds, dtype=torch.float64)
+    return LinearConstraint(2, A=lambda obs: A, b=lambda obs: b)
+
+
+def boundary(constraint: Constraint, obs: Tensor) -> np.ndarray:
+    """Points (1440, 2) around the boundary of a set of two dimensions at obs (n,), from its gauge."""
+    angles = torch.linspace(0.0, 2.0 * math.pi, 1441, dtype=torch.float64)[:-1]
+    directions = torch.stack((angles.cos(), angles.sin()), -1)
+    center = constraint.center(obs)
+    gauge = constraint.gauge(obs, directions, center)
+    return (center + directions / gauge.unsqueeze(-1)).numpy()
+
+
+def draw_maps(folder: Path, formats: Sequence[str]) -> list[Path]:
+    """The paper's Figure 1: what the three maps make of the same two actions."""
+    constraint, obs = polygon(), torch.zeros(1, dtype=torch.float64)
+    center = constraint.center(obs)
+    # Both are nearest to the same corner, so the projection cannot tell them apart and its gradient is zero.
+    actions = torch.tensor([[1.16, 0.30], [1.20, -0.13]], dtype=torch.float64)
+    maps: dict[str, Callable[[Tensor], Tensor]] = {
+        "Closest-point projection": lambda action: constraint.project(obs, action),
+        r"$\alpha$-projection": lambda action: constraint.alpha_map(obs, action),
+        "Radial squashing": lambda action: constraint.radial_map(obs, action),
+    }
+    figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    for axes, (title, mapping) in zip(figure.subplots(1, 3), maps.items(), strict=True):
+        axes.add_patch(Polygon(boundary(constraint, obs), facecolor=SET_COLOR, edgecolor="#1f4fa8", linewidth=1.5))
+        _name_point(axes, r"$\mathcal{A}_s$", (-0.5, 0.25))
+        by_rays = not title.startswith("Closest")
+        if by_rays:
+            axes.plot(*center, marker="o", color="black", markersize=4)
+            _name_point(axes, "$c_s$", center.tolist(), (-16, 2))
+        mapped = mapping(actions)
+        for start, end, color in zip(actions.tolist(), mapped.tolist(), POINT_COLORS, strict=True):
+            if by_rays:
+                axes.plot(*zip(center.tolist(), end, strict=True), ":", color=color, linewidth=1)
+            arrow = {"arrowstyle": "-|>", "color": color, "shrinkA": 0, "shrinkB": 3}
+            axes.annotate("", end, start, arrowprops=arrow)
+            axes.plot(*start, "o", color=color, markerfacecolor="white", markersize=6)
+            axes.plot(*end, "o", color=color, markersize=6)
+        for name, start, end, below in zip(("a", "a'"), actions.tolist(), mapped.tolist(), (False, True), strict=True):
+            _name_point(axes, f"${name}$", start, (7, -4))
+            if by_rays:
+                _name_point(axes, f"$P_s({name})$", end, (-38, -17 if below else 8))
+        if not by_rays:
+            _name_point(axes, "$P_s(a) = P_s(a')$", mapped[0].tolist(), (-98, -4))
+        axes.set_title(title)
+        axes.set_xlim(-0.8, 1.4)
+        axes.set_ylim(-0.66, 0.78)
+        axes.set_aspect("equal")
+        axes.axis("off")
+    return save(figure, folder, "maps", formats)
+
+
+def _name_point(axes: Axes, name: str, point: Sequence[float], offset: tuple[float, float] = (0, 0)) -> None:
+    """Write `name` `offset` printer's points away from `point`."""
+    axes.annotate(name, point, offset, textcoords="offset points", fontsize=12)
+
+
+class Episode(NamedTuple):
+    """What a policy did in an episode of T steps."""
+
+    obs: np.ndarray  # (T, n)
+    action: np.ndarray  # (T, d), executed
+    reward: np.ndarray  # (T,)
+
+
+def play(run: Run) -> Episode:
+    """The first evaluation episode of the run's seed, played with its best parameters.
+
+    Raises ConfigError if the run's algorithm or task is unknown here or its parameters are missing or of another
+    shape.
+    """
+    if run.task not in envs.TASKS or run.algo not in ALGORITHMS:
+        raise ConfigError(f"{run.folder}: {run.algo} on {run.task} is not of this project")
+    algorithm = ALGORITHMS[run.algo]
+    env = envs.make(run.task)
+    try:
+        agent = algorithm.agent(
+            Config(**run.config),
+            env.constraint,
+            env.observation_space.shape[0],
+            [run.seed],
+            mapping=algorithm.mapping,
+            placement=algorithm.placement,
+        )
+        agent.load_state(0, torch.load(run.folder / "best.pt", weights_only=True))
+    except (OSError, TypeError, KeyError, RuntimeError) as error:
+        raise ConfigError(f"{run.folder / 'best.pt'}: cannot load it ({error})") from error
+    policy = agent.policy([0])
+    steps, done = [], False
+    obs, _ = env.reset(seed=stream_seed(run.seed, "evaluation"))
+    while not done:
+        action = policy(torch.as_tensor(obs, dtype=torch.float32)[None, None])[0, 0].numpy()
+        next_obs, reward, terminated, truncated, _ = env.step(action)
+        steps.append((obs, action, reward))
+        obs, done = next_obs, terminated or truncated
+    env.close()
+    return Episode(*(np.stack(column) for column in zip(*steps, strict=True)))
+
+
+def draw_actions(folder: Path, out: Path, formats: Sequence[str]) -> list[Path]:
+    """Feasible set and executed action at moments of an episode, and how far out the actions are throughout.
+
+    `folder` is a run's. Raises ConfigError if it is none, or if its task has not two dimensions.
+    """
+    try:
+        run = read_run(folder)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    planar = [name for name, task in envs.TASKS.items() if task.constraint.dim == 2]
+    if run.task not in planar:
+        raise ConfigError(
+            f"{folder}: {run.task} is no task of two dimensions (choices: {', '.join(order_tasks(planar))})"
+        )
+    episode = play(run)
+    constraint = envs.constraint(run.task)
+    obs, action = torch.as_tensor(episode.obs), torch.as_tensor(episode.action, dtype=torch.float64)
+    center = constraint.center(obs)
+    reach = constraint.gauge(obs, action - center, center).numpy()
+    moments = np.linspace(0, len(obs) - 1, PANELS).round().astype(int)
+
+    figure = Figure(figsize=(10.5, 7.2), layout="constrained")
+    grid = figure.add_gridspec(3, PANELS // 2, height_ratios=[1.0, 1.0, 0.7])
+    outlines = [boundary(constraint, obs[t]) for t in moments]
+    limit = 1.08 * max(np.abs(outline).max() for outline in outlines)
+    for k, (t, outline) in enumerate(zip(moments, outlines, strict=True)):
+        axes = figure.add_subplot(grid[divmod(k, PANELS // 2)])
+        _draw_moment(axes, outline, episode.action[t], limit)
+        axes.set_title(f"step {t + 1}", fontsize="medium")
+    axes = figure.add_subplot(grid[2, :])
+    axes.plot(np.arange(1, len(reach) + 1), reach, color="#1f4fa8", linewidth=1.2)
+    axes.plot(moments + 1, reach[moments], "o", color=POINT_COLORS[0], markersize=4)
+    axes.set_xlim(0, len(reach) + 1)
+    axes.set_ylim(0.0, 1.08)
+    axes.set_xlabel("Step of the episode")
+    axes.set_ylabel("Share of the way\nfrom centre to boundary")
+    plain(axes)
+    returned = episode.reward.sum()
+    figure.suptitle(
+        f"{run.variant} on {run.task}, seed {run.seed}: feasible set and executed action (return {returned:.2f})"
+    )
+    return save(figure, out, f"actions-{run.task},{run.variant},seed={run.seed}", formats)
+
+
+def _draw_moment(axes: Axes, outline: np.ndarray, action: np.ndarray, limit: float) -> None:
+    axes.add_patch(Polygon(outline, facecolor=SET_COLOR, edgecolor="#1f4fa8", linewidth=1.2))
+    axes.plot(*action, "o", color=POINT_COLORS[0], markersize=6)
+    axes.set_xlim(-limit, limit)
+    axes.set_ylim(-limit, limit)
+    axes.set_aspect("equal")
+    axes.set_xlabel("$a_1$")
+    axes.set_ylabel("$a_2$")
+    plain(axes)

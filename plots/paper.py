@@ -1,0 +1,65 @@
+"""What the paper fixes: its algorithms in order, their colours here, and its table of rewards."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+# A version with penalty is the darker shade of the one without; the TD3 family is drawn solid, the SAC family dashed.
+COLORS = {
+    "DPro": "#7fb2e5",
+    "DPro+": "#1f4fa8",
+    "DPre": "#86c96b",
+    "DPre+": "#1e6b26",
+    "DOpt": "#f7a93b",
+    "DOpt+": "#b8520a",
+    "NFW": "#d62728",
+    "DAlpha": "#9467bd",
+    "DRad": "#7a4a2b",
+    "SPre": "#35c4c4",
+    "SPre+": "#0b6275",
+    "SAlpha": "#e056b0",
+    "SRad": "#222222",
+}
+FAMILIES = {"TD3 family": list(COLORS)[:9], "SAC family": list(COLORS)[9:]}
+# Without constraints a penalty is zero and a projection the identity, so the paper trains one of each family.
+UNCONSTRAINED = "R+N"
+SAME_WITHOUT_CONSTRAINT = dict.fromkeys(("DPro+", "DPre", "DPre+", "DOpt", "DOpt+"), "DPro") | {"SPre+": "SPre"}
+PAPER_SEEDS = 10
+DEFAULT_BATCH = "default"
+
+
+class Statistic(NamedTuple):
+    """Mean of n values with its standard error (NaN for n = 1)."""
+
+    mean: float
+    se: float
+    n: int
+
+
+@cache
+def read_paper() -> dict[tuple[str, str, str], Statistic]:
+    """The paper's Table "Average Rewards" by (task, batch, algorithm); batch is "16" or DEFAULT_BATCH."""
+    with open(Path(__file__).parent / "paper_table.csv", newline="") as file:
+        return {
+            (row["task"], row["batch"], row["algo"]): Statistic(float(row["mean"]), float(row["se"]), PAPER_SEEDS)
+            for row in csv.DictReader(file)
+        }
+
+
+def order_tasks(names: Iterable[str]) -> list[str]:
+    """In the paper's order, tasks that it does not have after its own."""
+    return _order(names, dict.fromkeys(task for task, _, _ in read_paper()))
+
+
+def order_algos(names: Iterable[str]) -> list[str]:
+    return _order(names, COLORS)
+
+
+def _order(names: Iterable[str], known: Iterable[str]) -> list[str]:
+    names = set(names)
+    known = [name for name in known if name in names]
+    return known + sorted(names.difference(known))

@@ -1,0 +1,44 @@
+"""How every figure looks, and how it is saved."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from plots.paper import COLORS, FAMILIES
+
+FORMATS = ("png", "pdf")
+
+
+def color_of(algo: str) -> str:
+    # A name that the paper does not have gets a grey that depends on nothing but the name.
+    return COLORS.get(algo) or str(0.3 + 0.4 * (sum(algo.encode()) % 8) / 7)
+
+
+def line_of(algo: str, points: int) -> dict[str, Any]:
+    """Keywords of a line through so many points."""
+    line = "dashed" if algo in FAMILIES["SAC family"] else "solid" if algo in COLORS else "dashdot"
+    marker = "." if 0 < points < 20 else ""
+    return {"color": color_of(algo), "linestyle": line, "linewidth": 1.5, "marker": marker}
+
+
+def plain(axes: Axes) -> None:
+    """A light grid, and no frame on top and on the right."""
+    axes.grid(alpha=0.3)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def save(figure: Figure, folder: Path, name: str, formats: Sequence[str]) -> list[Path]:
+    """Save as `folder/name` in those of `formats` that are a figure's; characters awkward in a file name become _."""
+    folder.mkdir(parents=True, exist_ok=True)
+    name = re.sub(r"[^\w+,=.\[\]-]+", "_", name)
+    paths = [folder / f"{name}.{suffix}" for suffix in formats if suffix in FORMATS]
+    for path in paths:
+        figure.savefig(path, dpi=150)
+    return paths

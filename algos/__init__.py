@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from algos.nfwpo import NFWPO
 from algos.sac import SAC
 from algos.td3 import TD3
+from constraints import Constraint
 from core.agent import Agent, MapName, Placement
+from core.config import Config
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,10 @@ class Algorithm:
     def base(self) -> str:
         """The base algorithm, which decides the hyperparameters: "TD3" or "SAC"."""
         return "SAC" if issubclass(self.agent, SAC) else "TD3"
+
+    def build(self, config: Config, constraint: Constraint, obs_dim: int, seeds: Sequence[int]) -> Agent:
+        """A new agent that trains `seeds` in lockstep."""
+        return self.agent(config, constraint, obs_dim, seeds, mapping=self.mapping, placement=self.placement)
 
 
 ALGORITHMS: dict[str, Algorithm] = {

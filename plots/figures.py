@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, LogFormatter
 
 from core.results import Run
 from plots.grouping import Condition, Groups, order_conditions
@@ -19,6 +22,7 @@ from plots.style import color_of, line_of, plain, save
 
 LOGARITHMIC = ("temperature",)
 """Training measures that change by orders of magnitude."""
+MANY = 8
 
 
 def mean_curve(curves: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -42,19 +46,28 @@ def learning_curve(runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 def draw_conditions(groups: Groups, folder: Path, formats: Sequence[str]) -> list[Path]:
     """A figure of learning curves for each condition, and one of training measures where there are any."""
-    written = []
-    for condition in chain.from_iterable(order_conditions(groups)):
-        evaluated = {
-            algo: groups[condition][algo]
-            for algo in order_algos(groups[condition])
-            if any(len(run.evaluations.step) for run in groups[condition][algo])
-        }
-        if evaluated:
-            written += save(_learning_figure(condition, evaluated), folder, _file_name(condition), formats)
-        measured = {algo: runs for algo, runs in evaluated.items() if any(run.training for run in runs)}
-        if measured:
-            name = f"{_file_name(condition)}-training"
-            written += save(_training_figure(condition, measured), folder, name, formats)
+    conditions = list(chain.from_iterable(order_conditions(groups)))
+    draw = partial(_draw_condition, folder=folder, formats=formats)
+    arguments = conditions, [groups[condition] for condition in conditions]
+    # A figure takes up to a second: many are worth the start of a process for each processor.
+    if len(conditions) < MANY:
+        return list(chain.from_iterable(map(draw, *arguments)))
+    with ProcessPoolExecutor(max_workers=min(os.cpu_count() or 1, len(conditions))) as pool:
+        return list(chain.from_iterable(pool.map(draw, *arguments)))
+
+
+def _draw_condition(
+    condition: Condition, by_algo: dict[str, list[Run]], folder: Path, formats: Sequence[str]
+) -> list[Path]:
+    evaluated = {
+        algo: by_algo[algo] for algo in order_algos(by_algo) if any(len(run.evaluations.step) for run in by_algo[algo])
+    }
+    if not evaluated:
+        return []
+    written = save(_learning_figure(condition, evaluated), folder, _file_name(condition), formats)
+    measured = {algo: runs for algo, runs in evaluated.items() if any(run.training for run in runs)}
+    if measured:
+        written += save(_training_figure(condition, measured), folder, f"{_file_name(condition)}-training", formats)
     return written
 
 
@@ -86,6 +99,8 @@ def _training_figure(condition: Condition, by_algo: dict[str, list[Run]]) -> Fig
         _label_steps(axes, f"{measure.capitalize()} (mean ± standard error)")
         if measure in LOGARITHMIC:
             axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(LogFormatter())
+            axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
     figure.suptitle(condition.label)
     figure.legend(loc="outside right upper", frameon=False)
     return figure

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -86,7 +86,7 @@ def draw_maps(folder: Path, formats: Sequence[str]) -> list[Path]:
     return save(figure, folder, "maps", formats)
 
 
-def _name_point(axes: Axes, name: str, point: Sequence[float], offset: tuple[float, float] = (0, 0)) -> None:
+def _name_point(axes: Axes, name: str, point: Any, offset: tuple[float, float] = (0, 0)) -> None:
     """Write `name` `offset` printer's points away from `point`."""
     axes.annotate(name, point, offset, textcoords="offset points", fontsize=12)
 
@@ -107,17 +107,10 @@ def play(run: Run) -> Episode:
     """
     if run.task not in envs.TASKS or run.algo not in ALGORITHMS:
         raise ConfigError(f"{run.folder}: {run.algo} on {run.task} is not of this project")
-    algorithm = ALGORITHMS[run.algo]
     env = envs.make(run.task)
     try:
-        agent = algorithm.agent(
-            Config(**run.config),
-            env.constraint,
-            env.observation_space.shape[0],
-            [run.seed],
-            mapping=algorithm.mapping,
-            placement=algorithm.placement,
-        )
+        obs_dim = env.observation_space.shape[0]
+        agent = ALGORITHMS[run.algo].build(Config(**run.config), env.constraint, obs_dim, [run.seed])
         agent.load_state(0, torch.load(run.folder / "best.pt", weights_only=True))
     except (OSError, TypeError, KeyError, RuntimeError) as error:
         raise ConfigError(f"{run.folder / 'best.pt'}: cannot load it ({error})") from error
@@ -185,4 +178,5 @@ def _draw_moment(axes: Axes, outline: np.ndarray, action: np.ndarray, limit: flo
     axes.set_aspect("equal")
     axes.set_xlabel("$a_1$")
     axes.set_ylabel("$a_2$")
+    axes.label_outer()
     plain(axes)

@@ -114,15 +114,16 @@ def _chance_above(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def _estimate(statistic: Callable[..., np.ndarray], samples: Sequence[np.ndarray]) -> Estimate:
     """`statistic` of `samples` (..., n_k), each resampled on its own."""
-    interval = stats.bootstrap(
-        samples,
-        statistic,
-        n_resamples=RESAMPLES,
-        batch=200,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        vectorized=True,
-        axis=-1,
-        rng=np.random.default_rng(0),
-    ).confidence_interval
+    with np.errstate(invalid="ignore"):  # its standard error is not a number where runs failed
+        interval = stats.bootstrap(
+            samples,
+            statistic,
+            n_resamples=RESAMPLES,
+            batch=200,
+            confidence_level=CONFIDENCE,
+            method="percentile",
+            vectorized=True,
+            axis=-1,
+            rng=np.random.default_rng(0),
+        ).confidence_interval
     return Estimate(statistic(*samples, axis=-1), interval.low, interval.high)

@@ -1,4 +1,4 @@
-"""Run folders (core/results.py), and the tables and figures made from them (plot.py)."""
+"""Run folders (core/results.py), and the tables and curves made from them (plot.py, plots/)."""
 
 import csv
 import io
@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
+from synthetic import CONDITIONS, write_results
 
 import plot
 from core import results
+from plots import figures, grouping, paper, rewards, tables
 
 ROOT = Path(__file__).parents[1]
 STEPS = 20_000
@@ -264,10 +266,10 @@ def test_description_names_the_commit(tmp_path, monkeypatch):
 
 def test_statistics_against_scipy():
     values = np.random.default_rng(0).normal(5, 3, size=10)
-    stat = plot.statistic(values)
+    stat = grouping.statistic(values)
     assert stat.n == 10
     np.testing.assert_allclose([stat.mean, stat.se], [stats.tmean(values), stats.sem(values)], rtol=1e-12)
-    alone = plot.statistic([3.0])
+    alone = grouping.statistic([3.0])
     assert alone.mean == 3.0 and math.isnan(alone.se) and alone.n == 1
 
 
@@ -276,7 +278,7 @@ def test_learning_curve_averages_over_the_seeds_that_are_there(tmp_path):
     for seed, length in enumerate(lengths):
         write_run(tmp_path, "R+N", "SRad", seed, evaluations=length)
     runs, _ = results.read_results(tmp_path)
-    steps, mean, error = plot.learning_curve(runs)
+    steps, mean, error = figures.learning_curve(runs)
     values = np.full((4, 4), np.nan)
     for row, run in zip(values, runs, strict=True):
         row[: len(run.evaluations.step)] = run.evaluations.return_mean
@@ -284,7 +286,7 @@ def test_learning_curve_averages_over_the_seeds_that_are_there(tmp_path):
     np.testing.assert_allclose(mean, np.nanmean(values, axis=0), rtol=1e-12)
     np.testing.assert_allclose(error, stats.sem(values, axis=0, nan_policy="omit"), rtol=1e-12)
 
-    steps, mean, error = plot.learning_curve(runs[:1])
+    steps, mean, error = figures.learning_curve(runs[:1])
     np.testing.assert_array_equal(mean, runs[0].evaluations.return_mean)
     assert np.isnan(error).all()
 
@@ -293,30 +295,29 @@ def test_a_diverged_seed_is_not_averaged_away(tmp_path):
     write_run(tmp_path, "R+N", "SRad", 0)
     write_run(tmp_path, "R+N", "SRad", 1).append_evaluation(25_000, [math.nan] * 3, 1.0)
     runs, _ = results.read_results(tmp_path)
-    _, mean, _ = plot.learning_curve(runs)
+    _, mean, _ = figures.learning_curve(runs)
     assert math.isnan(mean[-1]) and np.isfinite(mean[:-1]).all()
 
 
 def test_best_three():
-    assert plot.best_three({"a": 1.0, "b": 4.0, "c": 3.0, "d": 2.0}) == {"b", "c", "d"}
-    assert plot.best_three({"a": -1.0, "b": -4.0, "c": -3.0, "d": -2.0}) == {"a", "d", "c"}
-    assert plot.best_three({"a": 1.0, "b": 4.0, "c": 3.0, "d": 1.0}) == {"a", "b", "c", "d"}  # tied third
-    assert plot.best_three({"a": math.nan, "b": 1.0}) == {"b"}
-    assert plot.best_three({"a": math.nan}) == set()
+    assert rewards.best_three({"a": 1.0, "b": 4.0, "c": 3.0, "d": 2.0}) == {"b", "c", "d"}
+    assert rewards.best_three({"a": -1.0, "b": -4.0, "c": -3.0, "d": -2.0}) == {"a", "d", "c"}
+    assert rewards.best_three({"a": 1.0, "b": 4.0, "c": 3.0, "d": 1.0}) == {"a", "b", "c", "d"}  # tied third
+    assert rewards.best_three({"a": 1.0, "b": 1.0}) == {"a", "b"}
 
 
 def test_the_papers_table_is_typed_right():
-    paper = plot.read_paper()
-    assert len(paper) == 188
-    assert {algo for _, _, algo in paper} == set(plot.COLORS)
-    assert list(dict.fromkeys((task, batch) for task, batch, _ in paper)) == list(PAPER_ROWS)
+    table = paper.read_paper()
+    assert len(table) == 188
+    assert {algo for _, _, algo in table} == set(paper.COLORS)
+    assert list(dict.fromkeys((task, batch) for task, batch, _ in table)) == list(PAPER_ROWS)
     for (task, batch), (means, errors, bold) in PAPER_ROWS.items():
-        row = {algo: stat for (t, b, algo), stat in paper.items() if (t, b) == (task, batch)}
+        row = {algo: stat for (t, b, algo), stat in table.items() if (t, b) == (task, batch)}
         assert sum(stat.mean for stat in row.values()) == pytest.approx(means, abs=1e-9)
         assert sum(stat.se for stat in row.values()) == pytest.approx(errors, abs=1e-9)
-        assert plot.best_three({algo: stat.mean for algo, stat in row.items()}) == bold
-    assert paper["R+L2", "default", "DPro"][:2] == (-4.65, 0.59)
-    assert paper["HC+O", "16", "SRad"][:2] == (7459, 169)
+        assert rewards.best_three({algo: stat.mean for algo, stat in row.items()}) == bold
+    assert table["R+L2", "default", "DPro"][:2] == (-4.65, 0.59)
+    assert table["HC+O", "16", "SRad"][:2] == (7459, 169)
 
 
 # ---- tables and figures ----
@@ -367,7 +368,7 @@ def test_markdown(mixed):
     root, _ = mixed
     text = (root / "tables" / "rewards.md").read_text()
     rows = [[cell.strip() for cell in line.strip("|\n").split("|")] for line in text.splitlines() if "|" in line]
-    assert rows[0] == ["Condition", *plot.COLORS, "Mine"]
+    assert rows[0] == ["Condition", *paper.COLORS, "Mine"]
     row = dict(zip(rows[0], rows[3], strict=True))
     assert [r[0] for r in rows[2:]] == ["R+N", "R+L2", "W+M", "W+M batch_size=16"]
     assert row["DPro"] == "-4.55 ± 0.10"
@@ -376,7 +377,7 @@ def test_markdown(mixed):
     assert row["Mine"] == "12.10 ± 0.06 n=3"
     assert row["DPre"] == "–"
     unconstrained = dict(zip(rows[0], rows[2], strict=True))
-    assert (unconstrained["DPro"], unconstrained["DOpt+"]) == ("**17.00** n=1", "as DPro")
+    assert (unconstrained["DPro"], unconstrained["DOpt+"]) == ("**17.00** n=1", "Same as DPro")
     assert (unconstrained["NFW"], unconstrained["SPre+"]) == ("–", "–")
     assert "R+L2 SRad: seed 3, 4, evaluated to step 0 to 10,000 of 20,000" in text
     assert "X+Y DRad: seed 0, evaluated to step 5,000 of 20,000" in text
@@ -409,8 +410,8 @@ def test_terminal(mixed):
 def test_terminal_wraps_and_prints_bold(mixed):
     root, _ = mixed
     runs, _ = results.read_results(root)
-    table = plot.reward_table(plot.reward_statistics(plot.group_runs(runs)))
-    narrow = plot.to_terminal(table, bold=True, width=40)
+    table = rewards.reward_table(grouping.group_runs(runs)[0])
+    narrow = tables.to_terminal(table, bold=True, width=40)
     plain = re.sub(r"\x1b\[\d?m", "", narrow)
     assert max(map(len, plain.splitlines()[1:])) <= 40
     assert all(algo in plain for algo in ("DPro", "DOpt", "NFW", "DRad", "SRad", "Mine"))
@@ -424,7 +425,9 @@ def test_latex(mixed):
     assert text.count(r"\begin") == text.count(r"\end") == 2
     body = text[text.index("Condition &") : text.index(r"\bottomrule")]
     rows = [line for line in body.splitlines() if line.endswith(r"\\")]
-    assert {line.count("&") for line in rows} == {14}
+    assert r" & \multicolumn{5}{c}{Same as DPro} & " in next(line for line in rows if line.startswith("R+N"))
+    widths = [1 + line.count("&") + sum(int(n) - 1 for n in re.findall(r"multicolumn{(\d+)}", line)) for line in rows]
+    assert set(widths) == {15}
     assert r"\textbf{19.60}" in body and r"$\pm$ 0.06" in body and "$-$4.55" in body
     assert r"batch\_size=16" in body and "±" not in body and "–" not in body
     assert r"\multicolumn{9}{c}{TD3 family} & \multicolumn{4}{c}{SAC family}" in text
@@ -432,15 +435,15 @@ def test_latex(mixed):
 
 def test_figures(mixed):
     root, _ = mixed
-    names = ["R+L2", "R+N", "W+M", "W+M,batch_size=16", "X+Y"]
+    names = ["R+L2", "R+N", "W+M", "W+M,batch_size=16", "X+Y", "aggregate", "improvement"]
     files = sorted(path.name for path in (root / "figures").iterdir())
     assert files == sorted(f"{name}.{suffix}" for name in names for suffix in ("png", "pdf"))
     for name in names:
         assert (root / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert (root / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
     labels = {
-        algo: plot._legend(algo, runs)
-        for condition, by_algo in plot.group_runs(results.read_results(root)[0]).items()
+        algo: figures._legend(algo, runs)
+        for condition, by_algo in grouping.group_runs(results.read_results(root)[0])[0].items()
         for algo, runs in by_algo.items()
         if condition == ("R+L2", "")
     }
@@ -462,8 +465,36 @@ def test_different_configurations_are_never_averaged(tmp_path):
         ("gamma=0.5", "SRad", 1000.0, "1"),
         ("gamma=0.99", "SRad", 15.0, "2"),
     }
-    names = ["R+N", "R+N,batch_size=16", "R+N,gamma=0.5", "R+N,gamma=0.99"]
+    names = ["R+N", "R+N,batch_size=16", "R+N,gamma=0.5", "R+N,gamma=0.99", "aggregate,gamma=0.99"]
     assert sorted(path.stem for path in (tmp_path / "figures").glob("*.png")) == names
+
+
+def test_an_override_and_an_older_default_keep_rows_of_their_own(tmp_path):
+    write_run(tmp_path, "R+N", "SRad", 0, result=10.0, tau=0.1, gamma=0.99)
+    write_run(tmp_path, "R+N", "SRad", 1, result=20.0, tau=0.2, gamma=0.99)
+    write_run(tmp_path, "R+N", "SRad", 2, result=30.0, overrides={"tau": 0.1}, gamma=0.5)
+    groups, repeated = grouping.group_runs(results.read_results(tmp_path)[0])
+    assert not repeated
+    cells = {condition.settings: [run.seed for run in by_algo["SRad"]] for condition, by_algo in groups.items()}
+    assert cells == {"gamma=0.99, tau=0.1": [0], "tau=0.2": [1], "gamma=0.5, tau=0.1": [2]}
+
+
+def test_a_repeated_seed_counts_once(tmp_path, capsys):
+    write_run(tmp_path, "R+N", "SRad", 0, result=10.0)
+    write_run(tmp_path, "R+N", "SRad", 0, result=30.0, overrides={"gamma": 0.99})
+    assert plot.main([str(tmp_path), "format=csv"]) == 0
+    assert "the same configuration and seed as" in capsys.readouterr().err
+    assert [(r["mean"], r["n"]) for r in records(tmp_path, "rewards")] == [("10.0", "1")]
+
+
+def test_a_failed_run_is_listed_and_marked(tmp_path, capsys):
+    for seed, value in enumerate((10.0, 12.0, math.nan)):
+        write_run(tmp_path, "R+N", "SRad", seed, result=value)
+    assert plot.main([str(tmp_path)]) == 0
+    assert "R+N SRad: seed 2 failed, its return is not a number" in capsys.readouterr().out
+    (cell,) = records(tmp_path, "rewards")
+    assert (cell["mean"], cell["n"], cell["failed"]) == ("11.0", "2", "1")
+    assert "**11.00** ± 1.00 n=2 1 failed" in (tmp_path / "tables" / "rewards.md").read_text()
 
 
 def test_one_run_in_progress_is_enough(tmp_path, capsys):
@@ -471,7 +502,76 @@ def test_one_run_in_progress_is_enough(tmp_path, capsys):
     assert plot.main([str(tmp_path)]) == 0
     assert "R+N SRad: seed 0, evaluated to step 10,000" in capsys.readouterr().out
     assert (tmp_path / "figures" / "R+N.png").exists()
-    assert list((tmp_path / "tables").iterdir()) == []
+    assert not (tmp_path / "tables").exists()
+
+
+def test_a_run_is_plotted_while_it_writes(tmp_path):
+    """Every moment between two writes, and one within a write, leaves something that can be plotted."""
+    writer = write_run(tmp_path, "R+L2", "SPre", 0, evaluations=0)
+    assert plot.main([str(tmp_path), "format=png"]) == 0
+    for step in (5_000, 10_000):
+        writer.append_evaluation(step, [1.0, 2.0, 3.0], 1.0)
+        assert plot.main([str(tmp_path), "format=png"]) == 0
+        assert results.read_run(writer.folder).evaluations.step[-1] == step
+        writer.append_statistics(step, {"temperature": 0.5, "entropy": -1.0})
+        assert plot.main([str(tmp_path), "format=png"]) == 0
+    for name in ("evaluations.csv", "training.csv"):
+        with open(writer.folder / name, "a") as file:
+            file.write("15000,1.")
+    assert plot.main([str(tmp_path), "format=png"]) == 0
+    run = results.read_run(writer.folder)
+    assert run.training["step"].tolist() == run.evaluations.step.tolist() == [5_000, 10_000]
+    names = sorted(path.name for path in (tmp_path / "figures").iterdir())
+    assert names == ["R+L2-training.png", "R+L2.png"]
+
+
+def test_training_measures_side_by_side(tmp_path):
+    for seed in range(2):
+        writer = write_run(tmp_path, "R+L2", "SRad", seed)
+        for i, step in enumerate((10_000, 15_000)):
+            writer.append_statistics(step, {"temperature": 0.1 + i, "entropy": -1.0 - seed})
+    write_run(tmp_path, "R+L2", "DRad", 0)
+    (by_algo,) = grouping.group_runs(results.read_results(tmp_path)[0])[0].values()
+    condition = grouping.Condition("R+L2", "")
+    figure = figures._training_figure(condition, {"SRad": by_algo["SRad"]})
+    returns, temperature, entropy = figure.axes
+    assert "return" in returns.get_ylabel() and "Temperature" in temperature.get_ylabel()
+    assert temperature.get_yscale() == "log" and entropy.get_yscale() == "linear"
+    np.testing.assert_allclose(temperature.lines[0].get_xydata(), [[10_000, 0.1], [15_000, 1.1]])
+    np.testing.assert_allclose(entropy.lines[0].get_ydata(), [-1.5, -1.5])
+    assert plot.main([str(tmp_path), "format=pdf"]) == 0
+    assert (tmp_path / "figures" / "R+L2-training.pdf").exists()
+
+
+@pytest.mark.parametrize("content", ["what\n1\n", "step,temperature\n1\n", "step,temperature\nx,y\n"])
+def test_a_corrupt_training_file_is_named(tmp_path, content):
+    path = write_run(tmp_path, "R+N", "SRad", 0).folder / "training.csv"
+    path.write_text(content)
+    runs, problems = results.read_results(tmp_path)
+    assert not runs and len(problems) == 1 and problems[0].startswith(f"{path}: ")
+
+
+def test_the_whole_benchmark_in_small(tmp_path, capsys):
+    """All 13 algorithms under all 16 conditions, fewer seeds and evaluations than the paper."""
+    write_results(tmp_path, seeds=2, evaluations=22)
+    assert plot.main([str(tmp_path), "format=csv,tex,pdf"]) == 0
+    printed = capsys.readouterr().out
+    assert "Not in the tables" not in printed
+    rows = records(tmp_path, "rewards")
+    assert len(rows) == 13 * len(CONDITIONS) == 208 and {row["n"] for row in rows} == {"2"}
+    # The paper's own settings come first, then a rule and the rows of batch size 16.
+    body = (tmp_path / "tables" / "rewards.tex").read_text().split(r"\midrule")
+    assert [re.findall(r"^([RHW]\S*) &", part, flags=re.MULTILINE) for part in body[1:]] == [
+        [task for task, batch in CONDITIONS if batch == size] for size in ("default", "16")
+    ]
+    assert body[2].count(r"batch\_size=16") == 3
+    names = {path.stem for path in (tmp_path / "figures").glob("*.pdf")}
+    tasks = {task if batch == "default" else f"{task},batch_size=16" for task, batch in CONDITIONS}
+    assert names == {
+        *tasks,
+        *(f"{task}-training" for task in tasks),
+        *(f"{kind}{suffix}" for kind in ("aggregate", "improvement") for suffix in ("", ",batch_size=16")),
+    }
 
 
 def test_options(tmp_path):
@@ -504,8 +604,11 @@ def test_refusals(tmp_path, capsys):
     assert "choices: md, csv, tex, png, pdf" in fails(capsys, tmp_path, "format=jpg")
     assert "given twice" in fails(capsys, tmp_path, "env=W+M", "env=R+N")
     assert "expected env=value" in fails(capsys, tmp_path, "env=")
-    assert "expected one folder" in fails(capsys, tmp_path, "more")
-    assert "expected one folder" in fails(capsys, "env=W+M")
+    assert "expected one folder of results" in fails(capsys, tmp_path, "more")
+    assert "unexpected 'more'" in fails(capsys, "maps", "more")
+    assert "env= applies to a folder of results, not to tables" in fails(capsys, "tables", "env=W+M")
+    assert "choices: png, pdf" in fails(capsys, "maps", "format=md")
+    assert "expected one folder of results" in fails(capsys, "env=W+M")
     assert "no readable runs" in fails(capsys, tmp_path, "env=W+M", "algo=DPre+")
     blocked = tmp_path / "file"
     blocked.write_text("")

@@ -112,9 +112,9 @@ def plot_maps(words: Sequence[str], options: dict[str, str]) -> list[Path]:
 def plot_actions(words: Sequence[str], options: dict[str, str]) -> list[Path]:
     from plots.illustrations import draw_actions
 
-    run = _path(words, "folder of a run")
-    results = options.get("out", run.parents[2] if len(run.parents) > 2 else RESULTS)
-    return draw_actions(run, Path(results).expanduser() / "figures", _formats(options, style.FORMATS))
+    run = _path(words, "folder of a run").absolute()
+    out = Path(options.get("out", run.parent.parent.parent)).expanduser()
+    return draw_actions(run, out / "figures", _formats(options, style.FORMATS))
 
 
 def plot_runtime(words: Sequence[str], options: dict[str, str]) -> list[Path]:

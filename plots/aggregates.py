@@ -83,9 +83,9 @@ def improvement_table(aggregates: Sequence[Aggregates]) -> Table:
     algos = order_algos({algo for aggregate in aggregates for algo in aggregate.scores})
     sections, records = [], []
     for aggregate in aggregates:
-        rows = []
+        rows: list[list[Cell]] = []
         for first in aggregate.scores:
-            cells = [Cell((first, *filter(None, aggregate.settings.split(", "))))]
+            cells = text_cells("" if rows else aggregate.settings, first)
             for second in algos:
                 estimate = aggregate.improvements.get((first, second))
                 if estimate is None:
@@ -102,7 +102,7 @@ def improvement_table(aggregates: Sequence[Aggregates]) -> Table:
         "Probability of improvement: that a run of the row's algorithm is better than one of the column's, "
         f"mean over their common tasks; bold where its {INTERVAL} is above 0.5"
     )
-    return Table("improvement", title, ["Algorithm", *algos], 1, sections, records)
+    return Table("improvement", title, ["Settings", "Algorithm", *algos], 2, sections, records)
 
 
 def draw_aggregates(aggregates: Sequence[Aggregates], folder: Path, formats: Sequence[str]) -> list[Path]:

@@ -19,11 +19,13 @@ from algos import ALGORITHMS
 from constraints import Constraint, LinearConstraint
 from core.config import Config, ConfigError
 from core.random import stream_seed
-from core.results import Run, read_run
+from core.results import Run, find_runs, read_run
 from plots.paper import order_tasks
 from plots.style import plain, save
 
 SET_COLOR, POINT_COLORS = "#cfe0f3", ("#b8520a", "#1e6b26")
+# Both are nearest to the same corner, so the projection cannot tell them apart and its gradient is zero.
+SAMPLES = ((1.16, 0.30), (1.20, -0.13))
 PANELS = 8
 """Moments of an episode at which the feasible set is drawn."""
 
@@ -49,14 +51,13 @@ def draw_maps(folder: Path, formats: Sequence[str]) -> list[Path]:
     """The paper's Figure 1: what the three maps make of the same two actions."""
     constraint, obs = polygon(), torch.zeros(1, dtype=torch.float64)
     center = constraint.center(obs)
-    # Both are nearest to the same corner, so the projection cannot tell them apart and its gradient is zero.
-    actions = torch.tensor([[1.16, 0.30], [1.20, -0.13]], dtype=torch.float64)
+    actions = torch.tensor(SAMPLES, dtype=torch.float64)
     maps: dict[str, Callable[[Tensor], Tensor]] = {
         "Closest-point projection": lambda action: constraint.project(obs, action),
         r"$\alpha$-projection": lambda action: constraint.alpha_map(obs, action),
         "Radial squashing": lambda action: constraint.radial_map(obs, action),
     }
-    figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    figure = Figure(figsize=(10.5, 2.75), layout="constrained")
     for axes, (title, mapping) in zip(figure.subplots(1, 3), maps.items(), strict=True):
         axes.add_patch(Polygon(boundary(constraint, obs), facecolor=SET_COLOR, edgecolor="#1f4fa8", linewidth=1.5))
         _name_point(axes, r"$\mathcal{A}_s$", (-0.5, 0.25))
@@ -75,7 +76,7 @@ def draw_maps(folder: Path, formats: Sequence[str]) -> list[Path]:
         for name, start, end, below in zip(("a", "a'"), actions.tolist(), mapped.tolist(), (False, True), strict=True):
             _name_point(axes, f"${name}$", start, (7, -4))
             if by_rays:
-                _name_point(axes, f"$P_s({name})$", end, (-38, -17 if below else 8))
+                _name_point(axes, f"$P_s({name})$", end, (-44, -17 if below else 7))
         if not by_rays:
             _name_point(axes, "$P_s(a) = P_s(a')$", mapped[0].tolist(), (-98, -4))
         axes.set_title(title)
@@ -116,7 +117,8 @@ def play(run: Run) -> Episode:
         raise ConfigError(f"{run.folder / 'best.pt'}: cannot load it ({error})") from error
     policy = agent.policy([0])
     steps, done = [], False
-    obs, _ = env.reset(seed=stream_seed(run.seed, "evaluation"))
+    env.reset(seed=stream_seed(run.seed, "evaluation"))
+    obs, _ = env.reset()  # seeding takes a reset of its own, as for the evaluator
     while not done:
         action = policy(torch.as_tensor(obs, dtype=torch.float32)[None, None])[0, 0].numpy()
         next_obs, reward, terminated, truncated, _ = env.step(action)
@@ -131,6 +133,8 @@ def draw_actions(folder: Path, out: Path, formats: Sequence[str]) -> list[Path]:
 
     `folder` is a run's. Raises ConfigError if it is none, or if its task has not two dimensions.
     """
+    if folder not in find_runs(folder.parent.parent.parent):
+        raise ConfigError(f"{folder} is not the folder of a run (<results>/<task>/<algorithm>/seed=<n>)")
     try:
         run = read_run(folder)
     except ValueError as error:

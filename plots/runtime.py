@@ -114,6 +114,7 @@ def draw_runtime(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]
     names.spines["bottom"].set_visible(False)
     axes.set_ylabel("Seconds (mean ± standard error)")
     axes.set_title(_title(records, seconds), fontsize="medium", wrap=True)
+    axes.set_xlim(-0.7, len(algos) - 0.3)
     plain(axes)
     axes.grid(visible=False, axis="x")
     if any(record["gpu_seconds"] for record in records):

@@ -119,7 +119,7 @@ def _estimate(statistic: Callable[..., np.ndarray], samples: Sequence[np.ndarray
             samples,
             statistic,
             n_resamples=RESAMPLES,
-            batch=200,
+            batch=1000,
             confidence_level=CONFIDENCE,
             method="percentile",
             vectorized=True,

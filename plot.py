@@ -6,7 +6,7 @@
                                        tables/aggregate     interquartile mean over tasks, with intervals
                                        tables/improvement   probability that one algorithm is better than another
                                        figures/<task>       learning curves, also of runs in progress
-                                       figures/<task>-training   return, temperature and entropy of SAC
+                                       figures/<task>-training   return, temperature and entropy of SAC, all settings
                                        figures/aggregate, figures/improvement
     python plot.py tables            tables/tasks and tables/hyperparameters, from the code's definitions
     python plot.py maps              figures/maps: the three feasibility maps, the paper's Figure 1
@@ -31,7 +31,7 @@ from core.config import ConfigError, choose, split_names
 from core.results import find_runs, parse_variant, read_results
 from plots import style, tables
 from plots.aggregates import aggregate, draw_aggregates, improvement_table, mean_table
-from plots.figures import draw_conditions
+from plots.figures import draw_curves
 from plots.grouping import Groups, group_runs, list_left_out
 from plots.paper import order_algos, order_tasks
 from plots.rewards import comparison_table, reward_table
@@ -62,7 +62,7 @@ def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
             written += tables.write_table(table, out / "tables", formats, note)
     if note:
         print(note)
-    written += draw_conditions(groups, out / "figures", formats)
+    written += draw_curves(groups, out / "figures", formats)
     return written + draw_aggregates(aggregates, out / "figures", formats)
 
 

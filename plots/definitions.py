@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from itertools import groupby
-from typing import Any
+from typing import Any, get_args
 
+from core.agent import MapName
 from core.config import HYPERPARAMETERS, RUN_KEYS, Config, defaults
 from envs.tasks import TASKS, Task
 from plots.tables import MISSING, Cell, Table, text_cells
@@ -39,7 +40,7 @@ def hyperparameter_table() -> Table:
     records = []
     for setting in fields(Config):
         key = setting.name
-        values = [config[key] for config in columns.values()]
+        values = [config.get(key) for config in columns.values()]
         if key in (*RUN_KEYS, "steps") or all(value is None for value in values):
             continue
         row = text_cells(key, setting.metadata["help"], *(_text(value) for value in values))
@@ -53,9 +54,12 @@ def hyperparameter_table() -> Table:
 
 
 def _configuration(robot: str, base: str) -> dict[str, Any]:
-    """The settings on `robot` of an algorithm that has all of its base's."""
-    config = defaults(algo="", env="", robot=robot, base=base, frank_wolfe=base == "TD3", penalty=True, steps=0)
-    return asdict(config)
+    """Every setting on `robot` of any algorithm with this base."""
+    settings: dict[str, Any] = {}
+    for mapping in get_args(MapName):
+        config = defaults("", "", robot, base, mapping, frank_wolfe=base == "TD3", penalty=True, steps=0)
+        settings |= {key: value for key, value in asdict(config).items() if value is not None}
+    return settings
 
 
 def _text(value: Any) -> str:

@@ -7,8 +7,9 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from itertools import chain
+from itertools import chain, cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,6 +23,7 @@ from plots.style import color_of, line_of, plain, save
 
 LOGARITHMIC = ("temperature",)
 """Training measures that change by orders of magnitude."""
+LINE_STYLES = ("dashed", "solid", "dotted", "dashdot")
 MANY = 8
 
 
@@ -44,83 +46,80 @@ def learning_curve(runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray, np.ndar
     return mean_curve([(run.evaluations.step, run.evaluations.return_mean) for run in runs])
 
 
-def draw_conditions(groups: Groups, folder: Path, formats: Sequence[str]) -> list[Path]:
-    """A figure of learning curves for each condition, and one of training measures where there are any."""
+def draw_curves(groups: Groups, folder: Path, formats: Sequence[str]) -> list[Path]:
+    """A figure of learning curves for each condition, and one of training measures for each task that has any."""
     conditions = list(chain.from_iterable(order_conditions(groups)))
-    draw = partial(_draw_condition, folder=folder, formats=formats)
-    arguments = conditions, [groups[condition] for condition in conditions]
+    jobs = [partial(_draw_condition, condition, groups[condition]) for condition in conditions]
+    for task in dict.fromkeys(condition.task for condition in conditions):
+        of_task = {condition.settings: groups[condition] for condition in conditions if condition.task == task}
+        jobs.append(partial(_draw_training, task, of_task))
     # A figure takes up to a second: many are worth the start of a process for each processor.
-    if len(conditions) < MANY:
-        return list(chain.from_iterable(map(draw, *arguments)))
-    with ProcessPoolExecutor(max_workers=min(os.cpu_count() or 1, len(conditions))) as pool:
-        return list(chain.from_iterable(pool.map(draw, *arguments)))
+    if len(jobs) < MANY:
+        return [path for job in jobs for path in job(folder, formats)]
+    with ProcessPoolExecutor(max_workers=min(os.cpu_count() or 1, len(jobs))) as pool:
+        futures = [pool.submit(job, folder, formats) for job in jobs]
+        return [path for future in futures for path in future.result()]
 
 
 def _draw_condition(
     condition: Condition, by_algo: dict[str, list[Run]], folder: Path, formats: Sequence[str]
 ) -> list[Path]:
-    evaluated = {
-        algo: by_algo[algo] for algo in order_algos(by_algo) if any(len(run.evaluations.step) for run in by_algo[algo])
-    }
+    evaluated = [algo for algo in order_algos(by_algo) if any(len(run.evaluations.step) for run in by_algo[algo])]
     if not evaluated:
         return []
-    written = save(_learning_figure(condition, evaluated), folder, _file_name(condition), formats)
-    measured = {algo: runs for algo, runs in evaluated.items() if any(run.training for run in runs)}
-    if measured:
-        written += save(_training_figure(condition, measured), folder, f"{_file_name(condition)}-training", formats)
-    return written
-
-
-def _file_name(condition: Condition) -> str:
-    return condition.label.replace(", ", ",")
-
-
-def _learning_figure(condition: Condition, by_algo: dict[str, list[Run]]) -> Figure:
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.add_subplot()
-    _draw_returns(axes, by_algo)
+    for algo in evaluated:
+        _draw_curve(axes, algo, learning_curve(by_algo[algo]), label=_legend(algo, by_algo[algo]))
+    _label_axes(axes, "Evaluation return")
     axes.set_title(condition.label)
     figure.legend(loc="outside right upper", frameon=False)
-    return figure
+    return save(figure, folder, condition.label.replace(", ", ","), formats)
 
 
-def _training_figure(condition: Condition, by_algo: dict[str, list[Run]]) -> Figure:
-    """Returns and training measures of the algorithms that have such, side by side."""
-    columns = dict.fromkeys(name for runs in by_algo.values() for run in runs for name in run.training)
+def _draw_training(
+    task: str, by_settings: dict[str, dict[str, list[Run]]], folder: Path, formats: Sequence[str]
+) -> list[Path]:
+    """Returns and training measures side by side, of all runs with such: a line style for each of the settings."""
+    curves = [
+        (algo, style, ", ".join(filter(None, (_legend(algo, by_algo[algo]), settings))), by_algo[algo])
+        for (settings, by_algo), style in zip(by_settings.items(), cycle(LINE_STYLES), strict=False)
+        for algo in order_algos(by_algo)
+        if any(run.training for run in by_algo[algo])
+    ]
+    columns = dict.fromkeys(name for *_, runs in curves for run in runs for name in run.training)
     measures = [name for name in columns if name != "step"]
-    figure = Figure(figsize=(2.0 + 3.6 * (1 + len(measures)), 3.6), layout="constrained")
+    if not measures:
+        return []
+    figure = Figure(figsize=(1.5 + 3.6 * (1 + len(measures)), 4.2), layout="constrained")
     first, *others = figure.subplots(1, 1 + len(measures), sharex=True)
-    _draw_returns(first, by_algo)
+    for algo, style, label, runs in curves:
+        _draw_curve(first, algo, learning_curve(runs), label=label, linestyle=style)
+        for axes, measure in zip(others, measures, strict=True):
+            points = [(run.training["step"], run.training[measure]) for run in runs if measure in run.training]
+            if points:
+                _draw_curve(axes, algo, mean_curve(points), linestyle=style)
+    _label_axes(first, "Evaluation return")
     for axes, measure in zip(others, measures, strict=True):
-        for algo, runs in by_algo.items():
-            curves = [(run.training["step"], run.training[measure]) for run in runs if measure in run.training]
-            if curves:
-                _draw_curve(axes, algo, mean_curve(curves), "")
-        _label_steps(axes, f"{measure.capitalize()} (mean ± standard error)")
+        _label_axes(axes, measure.capitalize())
         if measure in LOGARITHMIC:
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter(LogFormatter())
             axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
-    figure.suptitle(condition.label)
-    figure.legend(loc="outside right upper", frameon=False)
-    return figure
+    figure.suptitle(task)
+    figure.legend(loc="outside lower center", ncols=min(len(curves), 3), frameon=False)
+    return save(figure, folder, f"{task}-training", formats)
 
 
-def _draw_returns(axes: Axes, by_algo: dict[str, list[Run]]) -> None:
-    for algo, runs in by_algo.items():
-        _draw_curve(axes, algo, learning_curve(runs), _legend(algo, runs))
-    _label_steps(axes, "Evaluation return (mean ± standard error)")
-
-
-def _draw_curve(axes: Axes, algo: str, curve: tuple[np.ndarray, np.ndarray, np.ndarray], label: str) -> None:
+def _draw_curve(axes: Axes, algo: str, curve: tuple[np.ndarray, np.ndarray, np.ndarray], **line: Any) -> None:
     steps, mean, error = curve
-    axes.plot(steps, mean, label=label, **line_of(algo, len(steps)))
+    axes.plot(steps, mean, **(line_of(algo, len(steps)) | line))
     axes.fill_between(steps, mean - error, mean + error, color=color_of(algo), alpha=0.15, lw=0)
 
 
-def _label_steps(axes: Axes, quantity: str) -> None:
+def _label_axes(axes: Axes, quantity: str) -> None:
     axes.set_xlabel("Environment steps")
-    axes.set_ylabel(quantity)
+    axes.set_ylabel(f"{quantity} (mean ± standard error)")
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     plain(axes)

@@ -38,7 +38,7 @@ class _Group:
 
     task: str
     algo: str
-    config: dict[str, Any]
+    config: dict[str, str]
     settings: dict[str, str]
     runs: dict[int, Run]
 
@@ -49,11 +49,13 @@ def group_runs(runs: Iterable[Run]) -> tuple[Groups, list[str]]:
     Usually a run's folder name tells what is special about it. Where configurations of one label differ all the
     same (defaults that changed between the runs, say), their labels name the settings that do.
     """
-    groups: dict[tuple[str, str, str], _Group] = {}
+    groups: dict[tuple, _Group] = {}
     repeated = []
     for run in runs:
-        config = {key: value for key, value in run.config.items() if key not in RUN_KEYS}
-        key = run.task, run.algo, json.dumps(config, sort_keys=True, default=str)
+        # A setting that an algorithm does not have is None, or missing in a run older than the setting.
+        settings = run.config.items()
+        config = {key: _text(value) for key, value in settings if key not in RUN_KEYS and value is not None}
+        key = run.task, run.algo, tuple(sorted(config.items()))
         group = groups.setdefault(key, _Group(run.task, run.algo, config, dict(run.overrides), {}))
         first = group.runs.setdefault(run.seed, run)
         if first is not run:
@@ -61,8 +63,8 @@ def group_runs(runs: Iterable[Run]) -> tuple[Groups, list[str]]:
     _tell_apart(list(groups.values()))
     result: Groups = defaultdict(dict)
     for group in groups.values():
-        settings = ", ".join(f"{key}={value}" for key, value in sorted(group.settings.items()))
-        result[Condition(group.task, settings)][group.algo] = [group.runs[seed] for seed in sorted(group.runs)]
+        label = ", ".join(f"{key}={value}" for key, value in sorted(group.settings.items()))
+        result[Condition(group.task, label)][group.algo] = [group.runs[seed] for seed in sorted(group.runs)]
     return dict(result), repeated
 
 
@@ -76,16 +78,15 @@ def _tell_apart(groups: Sequence[_Group]) -> None:
         if not alike:
             return
         for members in alike:
-            first, *others = [member.config for member in members]
-            keys = {key for config in (first, *others) for key in config}
-            for key in keys:
-                if any(other.get(key) != first.get(key) for other in others):
-                    for member in members:
-                        member.settings[key] = _text(member.config.get(key))
+            for key in {key for member in members for key in member.config}:
+                values = [member.config.get(key, _text(None)) for member in members]
+                if len(set(values)) > 1:
+                    for member, value in zip(members, values, strict=True):
+                        member.settings[key] = value
 
 
 def _text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"), default=str)
 
 
 def order_conditions(conditions: Iterable[Condition]) -> list[list[Condition]]:

@@ -156,9 +156,13 @@ def draw_actions(folder: Path, out: Path, formats: Sequence[str]) -> list[Path]:
     outlines = [boundary(constraint, obs[t]) for t in moments]
     limit = 1.08 * max(np.abs(outline).max() for outline in outlines)
     for k, (t, outline) in enumerate(zip(moments, outlines, strict=True)):
-        axes = figure.add_subplot(grid[divmod(k, PANELS // 2)])
+        row, column = divmod(k, PANELS // 2)
+        axes = figure.add_subplot(grid[row, column])
         _draw_moment(axes, outline, episode.action[t], limit)
         axes.set_title(f"step {t + 1}", fontsize="medium")
+        axes.set_xlabel("$a_1$" if row else "")
+        axes.set_ylabel("" if column else "$a_2$")
+        axes.tick_params(labelbottom=row > 0, labelleft=column == 0)
     axes = figure.add_subplot(grid[2, :])
     axes.plot(np.arange(1, len(reach) + 1), reach, color="#1f4fa8", linewidth=1.2)
     axes.plot(moments + 1, reach[moments], "o", color=POINT_COLORS[0], markersize=4)
@@ -168,9 +172,8 @@ def draw_actions(folder: Path, out: Path, formats: Sequence[str]) -> list[Path]:
     axes.set_ylabel("Share of the way\nfrom centre to boundary")
     plain(axes)
     returned = episode.reward.sum()
-    figure.suptitle(
-        f"{run.variant} on {run.task}, seed {run.seed}: feasible set and executed action (return {returned:.2f})"
-    )
+    title = f"{run.variant} on {run.task}, seed {run.seed}: feasible set and executed action (return {returned:.2f})"
+    figure.suptitle(title, wrap=True)
     return save(figure, out, f"actions-{run.task},{run.variant},seed={run.seed}", formats)
 
 
@@ -180,7 +183,4 @@ def _draw_moment(axes: Axes, outline: np.ndarray, action: np.ndarray, limit: flo
     axes.set_xlim(-limit, limit)
     axes.set_ylim(-limit, limit)
     axes.set_aspect("equal")
-    axes.set_xlabel("$a_1$")
-    axes.set_ylabel("$a_2$")
-    axes.label_outer()
     plain(axes)

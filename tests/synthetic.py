@@ -17,6 +17,7 @@ from core.results import RunWriter, run_folder, variant_name
 from plots.paper import COLORS, DEFAULT_BATCH, FAMILIES, read_paper
 
 CONDITIONS = list(dict.fromkeys((task, batch) for task, batch, _ in read_paper()))
+MAPPINGS = {"Alpha": "alpha", "Rad": "radial"}
 ROBOTS = {"R": "Reacher", "HC": "HalfCheetah", "H": "Hopper", "W": "Walker2d"}
 
 
@@ -33,7 +34,8 @@ def write_results(root, conditions=CONDITIONS, algos=tuple(COLORS), seeds=10, ev
         for algo in algos:
             base = "SAC" if algo in FAMILIES["SAC family"] else "TD3"
             steps = 300_000 if robot == "Reacher" else 1_000_000
-            config = defaults(algo, task, robot, base, algo == "NFW", algo.endswith("+"), steps)
+            mapping = MAPPINGS.get(algo[1:], "project")
+            config = defaults(algo, task, robot, base, mapping, algo == "NFW", algo.endswith("+"), steps)
             overrides = {} if batch == DEFAULT_BATCH else {"batch_size": int(batch)}
             for key, value in overrides.items():
                 setattr(config, key, value)

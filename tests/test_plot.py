@@ -479,6 +479,25 @@ def test_an_override_and_an_older_default_keep_rows_of_their_own(tmp_path):
     assert cells == {"gamma=0.99, tau=0.1": [0], "tau=0.2": [1], "gamma=0.5, tau=0.1": [2]}
 
 
+def test_a_setting_that_came_later_divides_only_who_has_it(tmp_path):
+    """Runs older than a setting lack its key; algorithms without it have None. 1 and 1.0 are told apart, and named."""
+    write_run(tmp_path, "R+N", "DRad", 0, result=10.0)
+    write_run(tmp_path, "R+N", "DRad", 1, result=10.0, entropy=None)
+    write_run(tmp_path, "R+N", "SRad", 0, result=10.0)
+    write_run(tmp_path, "R+N", "SRad", 1, result=10.0, entropy="paper")
+    write_run(tmp_path, "R+N", "NFW", 0, result=10.0, tau=1)
+    write_run(tmp_path, "R+N", "NFW", 1, result=10.0, tau=1.0)
+    groups, _ = grouping.group_runs(results.read_results(tmp_path)[0])
+    cells = {(c.settings, algo): [run.seed for run in runs] for c, row in groups.items() for algo, runs in row.items()}
+    assert cells == {
+        ("", "DRad"): [0, 1],
+        ("entropy=null", "SRad"): [0],
+        ("entropy=paper", "SRad"): [1],
+        ("tau=1", "NFW"): [0],
+        ("tau=1.0", "NFW"): [1],
+    }
+
+
 def test_a_repeated_seed_counts_once(tmp_path, capsys):
     write_run(tmp_path, "R+N", "SRad", 0, result=10.0)
     write_run(tmp_path, "R+N", "SRad", 0, result=30.0, overrides={"gamma": 0.99})
@@ -525,20 +544,27 @@ def test_a_run_is_plotted_while_it_writes(tmp_path):
     assert names == ["R+L2-training.png", "R+L2.png"]
 
 
-def test_training_measures_side_by_side(tmp_path):
+def test_training_measures_side_by_side(tmp_path, monkeypatch):
     for seed in range(2):
         writer = write_run(tmp_path, "R+L2", "SRad", seed)
         for i, step in enumerate((10_000, 15_000)):
             writer.append_statistics(step, {"temperature": 0.1 + i, "entropy": -1.0 - seed})
+    writer = write_run(tmp_path, "R+L2", "SRad", 0, overrides={"log_det_floor": 1e-6})
+    writer.append_statistics(10_000, {"temperature": 0.7, "entropy": -3.0})
     write_run(tmp_path, "R+L2", "DRad", 0)
-    (by_algo,) = grouping.group_runs(results.read_results(tmp_path)[0])[0].values()
-    condition = grouping.Condition("R+L2", "")
-    figure = figures._training_figure(condition, {"SRad": by_algo["SRad"]})
-    returns, temperature, entropy = figure.axes
+    drawn = {}
+    with monkeypatch.context() as patch:
+        patch.setattr(figures, "save", lambda figure, folder, name, formats: drawn.setdefault(name, figure) and [])
+        assert plot.main([str(tmp_path)]) == 0
+    returns, temperature, entropy = drawn["R+L2-training"].axes
     assert "return" in returns.get_ylabel() and "Temperature" in temperature.get_ylabel()
     assert temperature.get_yscale() == "log" and entropy.get_yscale() == "linear"
     np.testing.assert_allclose(temperature.lines[0].get_xydata(), [[10_000, 0.1], [15_000, 1.1]])
     np.testing.assert_allclose(entropy.lines[0].get_ydata(), [-1.5, -1.5])
+    np.testing.assert_allclose(entropy.lines[1].get_xydata(), [[10_000, -3.0]])
+    first, second = (line.get_label() for line in returns.lines)  # DRad has no such measures
+    assert first.startswith("SRad (0 of 2") and second.endswith("log_det_floor=1e-06")
+    assert returns.lines[0].get_linestyle() != returns.lines[1].get_linestyle()
     assert plot.main([str(tmp_path), "format=pdf"]) == 0
     assert (tmp_path / "figures" / "R+L2-training.pdf").exists()
 
@@ -569,7 +595,7 @@ def test_the_whole_benchmark_in_small(tmp_path, capsys):
     tasks = {task if batch == "default" else f"{task},batch_size=16" for task, batch in CONDITIONS}
     assert names == {
         *tasks,
-        *(f"{task}-training" for task in tasks),
+        *(f"{task}-training" for task, _ in CONDITIONS),
         *(f"{kind}{suffix}" for kind in ("aggregate", "improvement") for suffix in ("", ",batch_size=16")),
     }
 

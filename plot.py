@@ -186,7 +186,7 @@ def main(arguments: Sequence[str]) -> int:
         print(f"plot.py: {error}", file=sys.stderr)
         return 2
     for folder, count in Counter(path.parent for path in written).items():
-        print(f"{count} files in {folder}")
+        print(f"{count} file{'s' * (count > 1)} in {folder}")
     return 0
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, LogFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
 
 from core.results import Run
 from plots.grouping import Condition, Groups, order_conditions
@@ -71,7 +71,7 @@ def _draw_condition(
     axes = figure.add_subplot()
     for algo in evaluated:
         _draw_curve(axes, algo, learning_curve(by_algo[algo]), label=_legend(algo, by_algo[algo]))
-    _label_axes(axes, "Evaluation return")
+    _label_axes(axes, "Evaluation return (mean ± standard error)")
     axes.set_title(condition.label)
     figure.legend(loc="outside right upper", frameon=False)
     return save(figure, folder, condition.label.replace(", ", ","), formats)
@@ -104,9 +104,10 @@ def _draw_training(
         _label_axes(axes, measure.capitalize())
         if measure in LOGARITHMIC:
             axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(LogFormatter())
-            axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
-    figure.suptitle(task)
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_minor_locator(NullLocator())
+            axes.yaxis.set_major_formatter("{x:g}")
+    figure.suptitle(f"{task} (mean ± standard error)")
     figure.legend(loc="outside lower center", ncols=min(len(curves), 3), frameon=False)
     return save(figure, folder, f"{task}-training", formats)
 
@@ -119,7 +120,7 @@ def _draw_curve(axes: Axes, algo: str, curve: tuple[np.ndarray, np.ndarray, np.n
 
 def _label_axes(axes: Axes, quantity: str) -> None:
     axes.set_xlabel("Environment steps")
-    axes.set_ylabel(f"{quantity} (mean ± standard error)")
+    axes.set_ylabel(quantity)
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     plain(axes)

@@ -33,7 +33,9 @@ _NEAR_BOUNDARY = 1e-6
 _NO_INTERIOR = 1e-9
 # Constraints this near to the solution are active.
 _ACTIVE = 1e-9
+_NEWTON_STEPS = 4
 _POLISH_STEPS = 10
+_PROXIMAL_STEP = 100.0
 _LARGEST_PROGRAM = 20_000  # rows of one block-diagonal linear program
 
 
@@ -231,30 +233,73 @@ def _project(sets: _Sets, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _project_curved(sets: _Sets, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     inside = _interior(sets)
     distance = torch.linalg.vector_norm(target - inside, dim=-1, keepdim=True)
-    point, dual = _minimize(sets, inside, 1.0 / distance, (target - inside) / distance)
-    dual = dual * distance
-    m = sets.rows.shape[1]
+    point, multipliers = _minimize(sets, inside, 1.0 / distance, (target - inside) / distance)
+    point, multipliers = _polish(sets, target, point, multipliers * distance)
+    return _pull_towards(sets, inside, point), _metric(sets, multipliers), multipliers
+
+
+def _polish(sets: _Sets, target: Tensor, point: Tensor, multipliers: Tensor) -> tuple[Tensor, Tensor]:
+    """Projections (n, d) of the targets, exact to rounding, and multipliers (n, m + k), from approximate ones."""
+    solution, exact, done = _newton(sets, target, point, multipliers)
+    left = (~done).nonzero().squeeze(-1)
+    if len(left) > 0:
+        solution[left], exact[left] = _sequential_programs(sets[left], target[left], point[left], multipliers[left])
+    return solution, exact
+
+
+def _newton(sets: _Sets, target: Tensor, point: Tensor, multipliers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Newton's method on the optimality conditions, if the active constraints are those whose multiplier exceeds their
+    slack; point, multipliers and whether (n,) that was right."""
+    d = sets.dim
+    active = multipliers > _slack(sets, point)[0]
+    slot = active.long().argsort(dim=-1, descending=True, stable=True)[:, :d]
+    used = active.gather(-1, slot)
+    idle = torch.diag_embed((~used).to(point.dtype))
+    multipliers = torch.where(active, multipliers, 0.0)
+    for _ in range(_NEWTON_STEPS):
+        slack, normals = _slack(sets, point)
+        normals = normals.take_along_dim(slot.unsqueeze(-1), 1) * used.unsqueeze(-1)
+        top = torch.cat((_metric(sets, multipliers), normals.mT), -1)
+        system = torch.cat((top, torch.cat((normals, -idle), -1)), 1)
+        right = torch.cat((target - point, slack.gather(-1, slot) * used), -1)
+        step = torch.linalg.solve_ex(system, right.unsqueeze(-1))[0].squeeze(-1)
+        point = point + step[:, :d]
+        multipliers = torch.zeros_like(multipliers).scatter(-1, slot, step[:, d:] * used)
+    # Newton's error is of the order of its last step's square.
+    near = step[:, :d].abs().amax(-1) <= 1e-9
+    feasible = _slack(sets, point)[0].amin(-1) >= -1e-13
+    right_set = (active.sum(-1) <= d) & (multipliers >= 0.0).all(-1)
+    return point, multipliers, near & feasible & right_set
+
+
+def _slack(sets: _Sets, point: Tensor) -> tuple[Tensor, Tensor]:
+    """Slacks (n, m + k) of rows and ellipses, and the gradients (n, m + k, d) of what they bound."""
+    value, gradient = sets.ellipse_values(point)
+    return torch.cat((sets.bounds - _times(sets.rows, point), 1.0 - value), -1), torch.cat((sets.rows, gradient), 1)
+
+
+def _sequential_programs(
+    sets: _Sets, target: Tensor, point: Tensor, multipliers: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Sequential quadratic programming, which finds the active constraints by itself."""
     for _ in range(_POLISH_STEPS):
-        metric = _metric(sets, dual)
-        value, gradient = sets.ellipse_values(point)
-        root = torch.linalg.cholesky(metric)
-        normals = torch.cat((sets.rows, gradient), 1)
-        limits = torch.cat((sets.bounds - _times(sets.rows, point), 1.0 - value), 1)
+        root = torch.linalg.cholesky(_metric(sets, multipliers))
+        limits, normals = _slack(sets, point)
         normals = torch.linalg.solve_triangular(root, normals.mT, upper=False).mT
         norm = _nonzero(normals.norm(dim=-1))
         goal = torch.linalg.solve_triangular(root, (target - point).unsqueeze(-1), upper=False).squeeze(-1)
         step, multipliers = project_on_rows(normals / norm.unsqueeze(-1), limits / norm, goal, sets.name, 0)
         step = torch.linalg.solve_triangular(root.mT, step.unsqueeze(-1), upper=True).squeeze(-1)
-        multipliers = multipliers / norm
-        point, dual = point + step, multipliers[:, m:]
+        point, multipliers = point + step, multipliers / norm
         if bool((step.abs().amax(-1) <= 1e-14).all()):
             break
-    return _pull_towards(sets, inside, point), _metric(sets, dual), multipliers
+    return point, multipliers
 
 
-def _metric(sets: _Sets, dual: Tensor) -> Tensor:
-    """Hessian (n, d, d) of the projection's Lagrangian for the ellipses' multipliers (n, k)."""
-    return torch.eye(sets.dim, dtype=dual.dtype) + 2.0 * (dual[..., None, None] * sets.matrix).sum(1)
+def _metric(sets: _Sets, multipliers: Tensor) -> Tensor:
+    """Hessian (n, d, d) of the projection's Lagrangian for the multipliers (n, m + k)."""
+    curvature = multipliers[:, sets.rows.shape[1] :, None, None] * sets.matrix
+    return torch.eye(sets.dim, dtype=multipliers.dtype) + 2.0 * curvature.sum(1)
 
 
 def _jacobian(sets: _Sets, solution: Tensor, metric: Tensor, multipliers: Tensor) -> Tensor:
@@ -338,28 +383,27 @@ def _deepest(sets: _Sets) -> Tensor:
     require((sets.bounds >= 0.0) | solid.squeeze(-1), "the set is empty", sets.name)
     # Around the centre of the smallest ellipse, in its size, as in `_minimize`.
     traces = sets.matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
-    size = traces.amax(-1, keepdim=True).sqrt().clamp(min=1.0)
+    size = _size(sets)
     smallest = traces.argmax(-1)[:, None, None]
     origin = sets.center.take_along_dim(smallest, 1).squeeze(1).clamp(-1.0, 1.0)
-    value, slope = sets.ellipse_values(origin)
-    # In units of the violation; a zero matrix does not bound t.
-    curved = sets.root.isfinite()
-    unit = torch.where(curved, 0.5 * sets.root * size, 1.0)
-    matrix = torch.nn.functional.pad(sets.matrix * (unit / size**2)[..., None, None], (0, 1, 0, 1))
-    linear = torch.cat((slope * (unit / size).unsqueeze(-1), curved.to(slope.dtype).unsqueeze(-1)), -1)
-    constant = unit * (value - 1.0)
-    rows = torch.cat((sets.rows, solid.to(slope.dtype)), -1)
+    matrix, offset = _cones(sets, origin, size)
+    # The last coordinate is the depth; a zero matrix does not bound it.
+    sink = torch.zeros_like(offset)
+    sink[..., 0] = 1.0 / (size * sets.root)
+    matrix = torch.cat((matrix, sink.unsqueeze(-1)), -1)
+    rows = torch.cat((sets.rows, solid.to(sets.rows.dtype)), -1)
     bounds = size * (sets.bounds - _times(sets.rows, origin))
-    excess = torch.cat((torch.where(solid.squeeze(-1), -bounds, 0.0), constant), -1).clamp(min=0.0)
-    start = torch.cat((torch.zeros_like(origin), -1.0 - excess.amax(-1, keepdim=True)), -1)
-    gradient = torch.zeros_like(start)
+    gradient = torch.zeros_like(rows[:, 0])
     gradient[:, -1] = 1.0
-    solution, _ = minimize(torch.zeros_like(size), gradient, rows, bounds, (matrix, linear, constant), start, sets.name)
+    start = gradient * (size * sets.depth(origin).unsqueeze(-1)).clamp(max=0.0) - gradient
+    solution, _, converged = minimize(torch.zeros_like(size), gradient, rows, bounds, matrix, offset, start)
     solution = solution / size
-    depth = solution[:, -1]
-    require(depth >= -_NO_INTERIOR, "the set is empty", sets.name)
-    require(depth > _NO_INTERIOR, "the set has no interior", sets.name)
-    return origin + solution[:, :-1]
+    point = origin + solution[:, :-1]
+    deep = sets.depth(point) > _NO_INTERIOR
+    require(deep | converged, "the interior-point method failed", sets.name)
+    require(deep | (solution[:, -1] >= -_NO_INTERIOR), "the set is empty", sets.name)
+    require(deep, "the set has no interior", sets.name)
+    return point
 
 
 def _chebyshev(sets: _Sets) -> Tensor:
@@ -386,23 +430,40 @@ def _maximize_on_rows(sets: _Sets, slope: Tensor) -> Tensor:
 
 def _maximize_under_ellipses(sets: _Sets, slope: Tensor) -> Tensor:
     inside = _interior(sets)
-    solution, _ = _minimize(sets, inside, torch.zeros_like(slope[:, :1]), slope)
+    solution, multipliers = _minimize(sets, inside, torch.zeros_like(slope[:, :1]), slope)
+    # A step of the proximal point method: what is left of the error is its square over the step.
+    solution = _polish(sets, solution + _PROXIMAL_STEP * slope, solution, _PROXIMAL_STEP * multipliers)[0]
     return _pull_towards(sets, inside, solution)
 
 
 def _minimize(sets: _Sets, inside: Tensor, curvature: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """argmin a (n, d) of curvature |a - inside|^2 / 2 - <gradient, a> over sets with ellipses, and the multipliers of
-    the ellipses (n, k), from the interior points `inside`.
+    """argmin a (n, d) of curvature |a - inside|^2 / 2 - <gradient, a> over sets with ellipses, and the
+    multipliers (n, m + k), from the interior points `inside`.
 
     Solved for y = size (a - inside), in which the smallest ellipse is of order 1.
     """
-    size = sets.matrix.diagonal(dim1=-2, dim2=-1).sum(-1).amax(-1, keepdim=True).sqrt().clamp(min=1.0)
-    value, slope = sets.ellipse_values(inside)
-    quadratics = sets.matrix / size[..., None, None].square(), slope / size.unsqueeze(-1), value - 1.0
+    size = _size(sets)
     bounds = size * (sets.bounds - _times(sets.rows, inside))
     start = torch.zeros_like(inside)
-    point, dual = minimize(curvature / size, gradient, sets.rows, bounds, quadratics, start, sets.name)
-    return inside + point / size, dual / size
+    matrix, offset = _cones(sets, inside, size)
+    point, dual, _ = minimize(curvature / size, gradient, sets.rows, bounds, matrix, offset, start)
+    # In units of a; the ellipses' for the square of what the cone bounds, hence half.
+    m = sets.rows.shape[1]
+    return inside + point / size, torch.cat((dual[:, :m], 0.5 * dual[:, m:] / size), -1)
+
+
+def _size(sets: _Sets) -> Tensor:
+    """Inverse size (n, 1) of the smallest ellipse, at least that of the box."""
+    return sets.matrix.diagonal(dim1=-2, dim2=-1).sum(-1).amax(-1, keepdim=True).sqrt().clamp(min=1.0)
+
+
+def _cones(sets: _Sets, inside: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    """The ellipses as cones of offset (n, k, 1 + d) - matrix (n, k, 1 + d, d) @ y for y = size (a - inside)."""
+    value, axes = torch.linalg.eigh(sets.matrix)
+    root = value.clamp(min=0.0).sqrt().unsqueeze(-1) * axes.mT
+    offset = _times(root, inside.unsqueeze(1) - sets.center)
+    matrix = torch.nn.functional.pad(-root / size[..., None, None], (0, 0, 1, 0))
+    return matrix, torch.nn.functional.pad(offset, (1, 0), value=1.0)
 
 
 def _solve_linear_programs(objective: Tensor, rows: Tensor, bounds: Tensor) -> Tensor:

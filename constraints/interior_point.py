@@ -1,8 +1,8 @@
-"""Convex programs with rows and ellipses, in batch, by a feasible primal-dual interior-point method.
+"""Second-order cone programs in batch, by a primal-dual interior-point method.
 
-Mehrotra's predictor-corrector steps on the perturbed KKT conditions (Nocedal and Wright 2006, Sec. 19.3), with the
-curvature of the quadratics in the Newton matrix. Every point is strictly feasible: the way to the boundary along a
-step is known exactly, for quadratics too.
+Mehrotra's predictor-corrector steps with Nesterov and Todd's scaling (Vandenberghe 2010, "The CVXOPT linear and
+quadratic cone program solvers"). An ellipse is a cone here, not a smooth function of the point: Newton's steps on the
+function's own optimality conditions can come to rest at the boundary of a thin set, far from the solution.
 """
 
 from __future__ import annotations
@@ -10,13 +10,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from constraints.errors import SampleName, require
-
-_MAX_STEPS = 100
-_GAP = 1e-14
-_RESIDUAL = 1e-11
-# What a sample that stalls short of the above, at the limits of its conditioning, must at least have reached.
-_ACCEPTED_GAP = 1e-10
+_MAX_STEPS = 60
+_PATIENCE = 8
+_GAP = 1e-12
+_RESIDUAL = 1e-10
+# A sample that stalls at the limits of its conditioning has converged if it came this near to the above.
+_ACCEPTED = 1e3
 
 
 def minimize(
@@ -24,99 +23,160 @@ def minimize(
     gradient: Tensor,
     rows: Tensor,
     bounds: Tensor,
-    quadratics: tuple[Tensor, Tensor, Tensor],
+    matrix: Tensor,
+    offset: Tensor,
     start: Tensor,
-    name: SampleName,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """argmin y (n, d) of curvature |y|^2 / 2 - <gradient, y> subject to rows (n, m, d) @ y <= bounds (n, m) and
-    y'P_k y + q_k.y + r_k <= 0, with quadratics P (n, k, d, d), q (n, k, d), r (n, k).
+    u_0 >= |(u_1, ..., u_q)| for u = offset (n, k, 1 + q) - matrix (n, k, 1 + q, d) @ y.
 
     curvature is (n, 1), gradient and the strictly feasible start are (n, d). The objective and constraints should be of
-    order 1. Also returns the multipliers of the quadratics (n, k). Raises a ConstraintError, naming the sample by
-    `name`, where the method fails.
+    order 1. Also returns the multipliers (n, m + k) of the rows and the u_0, and whether (n,) the method converged; where
+    it did not, the point is the best one of those it came to, which all are feasible.
     """
-    matrix, linear, constant = quadratics
-    identity = curvature.unsqueeze(-1) * torch.eye(rows.shape[-1], dtype=rows.dtype)
-    m = rows.shape[1]
+    m, (k, q, dim) = rows.shape[1], matrix.shape[1:]
+    count = len(rows)
+    stacked = torch.cat((rows, matrix.flatten(1, 2)), 1)
+    limits = torch.cat((bounds, offset.flatten(1)), 1)
+    root = curvature.sqrt().unsqueeze(-1) * torch.eye(dim, dtype=rows.dtype)
+    unit = torch.zeros_like(limits[:1])
+    unit[:, :m] = 1.0
+    unit[:, m::q] = 1.0
 
-    def evaluate(point: Tensor) -> tuple[Tensor, Tensor]:
-        """Slacks (n, m + k) and the constraints' gradients (n, m + k, d)."""
-        bent = _times(matrix, point.unsqueeze(1))
-        value = ((bent + linear) * point.unsqueeze(1)).sum(-1) + constant
-        return torch.cat((bounds - _times(rows, point), -value), -1), torch.cat((rows, 2.0 * bent + linear), 1)
+    def cones(vector: Tensor) -> Tensor:
+        return vector[:, m:].unflatten(1, (k, q))
 
+    # On the central path but for the gradient: every slack times its multiplier is the set's size.
     point = start
-    slack, jacobian = evaluate(point)
-    dual = 1.0 / slack.clamp(min=1.0)
-    best, best_dual, least = point, dual, torch.full_like(point[:, 0], torch.inf)
-    for _ in range(_MAX_STEPS):
-        stationary = curvature * point - gradient + _times(jacobian.mT, dual)
-        gap, residual = (slack * dual).mean(-1), stationary.abs().amax(-1)
+    slack = limits - _times(stacked, point)
+    cone = cones(slack)
+    mirrored = torch.cat((cone[..., :1], -cone[..., 1:]), -1) / _size(cone).square()
+    dual = slack.amax(-1, keepdim=True) * torch.cat((1.0 / slack[:, :m], mirrored.flatten(1)), 1)
+    best, best_dual = point.clone(), dual.clone()
+    least, improved = torch.full((count,), torch.inf, dtype=rows.dtype), torch.zeros(count, dtype=torch.long)
+    sample = torch.arange(count)  # the samples still at work
+    for number in range(_MAX_STEPS):
+        stationary = curvature * point - gradient + _times(stacked.mT, dual)
+        infeasible = slack + _times(stacked, point) - limits
+        gap = (slack * dual).sum(-1) / (m + k)
+        residual = torch.maximum(stationary.abs().amax(-1), infeasible.abs().amax(-1))
         error = torch.maximum(gap / _GAP, residual / _RESIDUAL)
-        better = error < least
-        best = torch.where(better.unsqueeze(-1), point, best)
-        best_dual = torch.where(better.unsqueeze(-1), dual, best_dual)
-        least = torch.where(better, error, least)
-        # What is not finite any more has reached the limit of its conditioning.
-        if bool(((error <= 1.0) | ~error.isfinite()).all()):
+        better = error < least[sample]
+        found = sample[better]
+        best[found], best_dual[found], least[found], improved[found] = point[better], dual[better], error[better], number
+        # What has not come nearer for a while, or is not finite any more, has reached the limit of its conditioning.
+        live = ((error > 1.0) & error.isfinite() & (number - improved[sample] < _PATIENCE)).nonzero().squeeze(-1)
+        if len(live) == 0:
             break
+        if len(live) < len(sample):
+            sample, point, slack, dual = sample[live], point[live], slack[live], dual[live]
+            curvature, gradient, stacked, limits = curvature[live], gradient[live], stacked[live], limits[live]
+            root, stationary, infeasible, gap = root[live], stationary[live], infeasible[live], gap[live]
 
-        hessian = identity + 2.0 * (dual[:, m:, None, None] * matrix).sum(1)
-        newton = hessian + jacobian.mT @ ((dual / slack).unsqueeze(-1) * jacobian)
-        scale = newton.diagonal(dim1=-2, dim2=-1).rsqrt()
-        factor = torch.linalg.lu_factor_ex(newton * scale.unsqueeze(-1) * scale.unsqueeze(-2))[:2]
-        state = factor, scale, stationary, jacobian, slack, dual
+        scaling = _Scaling(slack, dual, m, k)
+        scaled = scaling.divide(stacked)
+        # Its normal equations would square the condition number.
+        basis, triangle = torch.linalg.qr(torch.cat((scaled, root), 1))
+        basis = basis[:, : scaled.shape[1]]
+        shift = scaling.divide(infeasible.unsqueeze(-1)).squeeze(-1)
 
-        move, dual_move = _direction(slack * dual, torch.zeros_like(slack), *state)
-        slope, bend = _along(rows, matrix, jacobian, move)
-        length = _longest(slack, slope, bend, dual, dual_move, 1.0)
-        predicted = ((slack - length * (slope + length * bend)) * (dual + length * dual_move)).mean(-1)
-        # A gap far below the residual would leave slacks too small to ever let the residual go.
-        floor = torch.minimum(gap, 0.1 * residual).clamp(min=0.1 * _GAP)
-        centering = torch.maximum((predicted / gap).clamp(0.0, 1.0) ** 3 * gap, floor).unsqueeze(-1)
-        # Second-order terms of complementarity and of the quadratics along the predicted step.
-        bend = bend * length.square()
-        move, dual_move = _direction(slack * dual - (slope + bend) * dual_move * length - centering, bend, *state)
-        slope, bend = _along(rows, matrix, jacobian, move)
-        length = _longest(slack, slope, bend, dual, dual_move, 0.99)
+        def step(
+            complementarity: Tensor, scaled=scaled, basis=basis, triangle=triangle, shift=shift, stationary=stationary
+        ) -> tuple[Tensor, Tensor, Tensor]:
+            """Newton step of the point, the scaled slacks and the scaled multipliers."""
+            right = torch.linalg.solve_triangular(triangle.mT, -stationary.unsqueeze(-1), upper=False)
+            right = right - basis.mT @ (shift - complementarity).unsqueeze(-1)
+            move = torch.linalg.solve_triangular(triangle, right, upper=True).squeeze(-1)
+            dual_move = _times(scaled, move) + shift - complementarity
+            return move, -complementarity - dual_move, dual_move
 
-        length = torch.where((error > 1.0).unsqueeze(-1), length, 0.0)
-        point, dual = point + length * move, dual + length * dual_move
-        slack, jacobian = evaluate(point)
-        # Rounding must not carry a slack of 1e-16 beyond 0.
-        slack = slack.clamp(min=1e-18)
-    require(least * _GAP <= _ACCEPTED_GAP, "the interior-point method failed; the set is too thin", name)
-    return best, best_dual[:, m:]
+        middle = scaling.middle
+        _, slack_move, dual_move = step(middle)
+        length = scaling.longest(slack_move, dual_move, 1.0)
+        predicted = ((middle + length * slack_move) * (middle + length * dual_move)).sum(-1) / (m + k)
+        centering = (predicted / gap).clamp(0.0, 1.0) ** 3 * gap
+        bend = scaling.product(slack_move, dual_move) - centering.unsqueeze(-1) * unit
+        move, slack_move, dual_move = step(middle + scaling.quotient(bend))
+        length = scaling.longest(slack_move, dual_move, 0.99)
 
-
-def _direction(
-    complementarity: Tensor,
-    bend: Tensor,
-    factor: tuple[Tensor, Tensor],
-    scale: Tensor,
-    stationary: Tensor,
-    jacobian: Tensor,
-    slack: Tensor,
-    dual: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Newton step of the point and of the multipliers that removes the residual `stationary` and `complementarity`,
-    when slacks fall by `bend` more than linearly."""
-    right = -stationary - _times(jacobian.mT, (dual * bend - complementarity) / slack)
-    move = torch.linalg.lu_solve(*factor, (right * scale).unsqueeze(-1)).squeeze(-1) * scale
-    return move, (dual * (_times(jacobian, move) + bend) - complementarity) / slack
+        point = point + length * move
+        slack = slack - length * (infeasible + _times(stacked, move))
+        dual = dual + length * scaling.divide(dual_move.unsqueeze(-1)).squeeze(-1)
+    return best, torch.cat((best_dual[:, :m], best_dual[:, m::q]), 1), least <= _ACCEPTED
 
 
-def _along(rows: Tensor, matrix: Tensor, jacobian: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
-    """First- and second-order coefficient (n, m + k) of the constraints' values along the move."""
-    bend = (_times(matrix, move.unsqueeze(1)) * move.unsqueeze(1)).sum(-1)
-    return _times(jacobian, move), torch.cat((torch.zeros_like(rows[..., 0]), bend), -1)
+class _Scaling:
+    """Nesterov and Todd's W, with W z = s / W = `middle`, of slacks s and multipliers z (n, m + k (1 + q)): a diagonal
+    on the rows, and on each cone a hyperbolic rotation w times a factor."""
+
+    def __init__(self, slack: Tensor, dual: Tensor, m: int, k: int):
+        self.m, self.k = m, k
+        self.diagonal = (slack[:, :m] / dual[:, :m]).sqrt()
+        cone, cone_dual = self._cones(slack), self._cones(dual)
+        size, dual_size = _size(cone), _size(cone_dual)
+        self.factor = (size / dual_size).sqrt()
+        cone, cone_dual = cone / size, cone_dual / dual_size
+        twice = (2.0 + 2.0 * (cone * cone_dual).sum(-1, keepdim=True)).sqrt()
+        first = (cone[..., :1] + cone_dual[..., :1]) / twice
+        self.rotation = first, (cone[..., 1:] - cone_dual[..., 1:]) / twice
+        self.middle = self.multiply(dual)
+        self.middle_size = _size(self._cones(self.middle))
+
+    def multiply(self, vector: Tensor) -> Tensor:
+        """W v for vectors (n, m + k (1 + q))."""
+        first, rest = self.rotation
+        cone = self._cones(vector)
+        head, tail = cone[..., :1], cone[..., 1:]
+        along = (rest * tail).sum(-1, keepdim=True)
+        out = torch.cat((first * head + along, tail + (head + along / (1.0 + first)) * rest), -1)
+        return torch.cat((self.diagonal * vector[:, : self.m], (self.factor * out).flatten(1)), 1)
+
+    def divide(self, columns: Tensor) -> Tensor:
+        """W^-1 of columns (n, m + k (1 + q), c)."""
+        first, rest = (part.unsqueeze(-1) for part in self.rotation)
+        cone = self._cones(columns)
+        head, tail = cone[:, :, :1], cone[:, :, 1:]
+        along = (rest * tail).sum(2, keepdim=True)
+        out = torch.cat((first * head - along, tail + (along / (1.0 + first) - head) * rest), 2)
+        rows = columns[:, : self.m] / self.diagonal.unsqueeze(-1)
+        return torch.cat((rows, (out / self.factor.unsqueeze(-1)).flatten(1, 2)), 1)
+
+    def product(self, left: Tensor, right: Tensor) -> Tensor:
+        """Jordan product (n, m + k (1 + q))."""
+        a, b = self._cones(left), self._cones(right)
+        out = torch.cat(((a * b).sum(-1, keepdim=True), a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:]), -1)
+        return torch.cat((left[:, : self.m] * right[:, : self.m], out.flatten(1)), 1)
+
+    def quotient(self, vector: Tensor) -> Tensor:
+        """v with `product(middle, v)` = vector."""
+        cone, value = self._cones(self.middle), self._cones(vector)
+        across = (cone[..., 1:] * value[..., 1:]).sum(-1, keepdim=True)
+        head = (cone[..., :1] * value[..., :1] - across) / self.middle_size.square()
+        out = torch.cat((head, (value[..., 1:] - head * cone[..., 1:]) / cone[..., :1]), -1)
+        return torch.cat((vector[:, : self.m] / self.middle[:, : self.m], out.flatten(1)), 1)
+
+    def longest(self, slack_move: Tensor, dual_move: Tensor, share: float) -> Tensor:
+        """Step length (n, 1) up to 1 that goes `share` of the way to where a slack or a multiplier leaves its cone."""
+        moves = torch.stack((slack_move, dual_move), 1)
+        rows = -moves[..., : self.m] / self.middle[:, None, : self.m]
+        moved = moves[..., self.m :].unflatten(2, (self.k, -1))
+        size = self.middle_size.unsqueeze(1)
+        cone = self._cones(self.middle).unsqueeze(1) / size
+        first, rest = cone[..., :1], cone[..., 1:]
+        head = first * moved[..., :1] - (rest * moved[..., 1:]).sum(-1, keepdim=True)
+        tail = moved[..., 1:] - (head + moved[..., :1]) / (first + 1.0) * rest
+        out = (torch.linalg.vector_norm(tail, dim=-1, keepdim=True) - head) / size
+        inverse = torch.maximum(rows.flatten(1).amax(-1), out.flatten(1).amax(-1)).unsqueeze(-1)
+        return share / inverse.clamp(min=share)
+
+    def _cones(self, vector: Tensor) -> Tensor:
+        return vector[:, self.m :].unflatten(1, (self.k, -1))
 
 
-def _longest(slack: Tensor, slope: Tensor, bend: Tensor, dual: Tensor, dual_move: Tensor, share: float) -> Tensor:
-    """Step length (n, 1) up to 1 that goes `share` of the way to where a slack or a multiplier would be 0."""
-    # slack = slope t + bend t^2, as a root for 1 / t, which may be 0.
-    inverse = (slope + (slope.square() + 4.0 * bend * slack).sqrt()) / (2.0 * slack)
-    return share / torch.maximum(inverse, -dual_move / dual).amax(-1, keepdim=True).clamp(min=share)
+def _size(cone: Tensor) -> Tensor:
+    """sqrt(u_0^2 - |u_1, ..., u_q|^2) (..., 1) of points (..., 1 + q) in the cone."""
+    head, tail = cone[..., :1], torch.linalg.vector_norm(cone[..., 1:], dim=-1, keepdim=True)
+    return ((head - tail) * (head + tail)).sqrt()
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:

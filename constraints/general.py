@@ -128,7 +128,7 @@ class GeneralConstraint(Constraint):
         size = slope.abs().amax(-1, keepdim=True)
         finite = size.isfinite()
         slope = torch.where(finite & (size > 0.0), slope / size, 0.0)
-        solution = _maximize_under_ellipses(sets, slope) if sets.curved else _maximize_on_rows(sets, slope)
+        solution = _optimum(sets, slope, linear=True)[0] if sets.curved else _maximize_on_rows(sets, slope)
         return torch.where(finite, solution, torch.nan).view(gradient.shape).to(gradient.device)
 
     def _center(self, obs: Tensor) -> Tensor:
@@ -218,33 +218,43 @@ def _nonzero(norm: Tensor) -> Tensor:
 
 def _project(sets: _Sets, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Closest points (n, d), Hessian of the Lagrangian there (n, d, d), multipliers of rows and ellipses (n, m + k)."""
-    metric = torch.eye(sets.dim, dtype=target.dtype).expand(len(target), sets.dim, sets.dim)
     if not sets.curved:
+        metric = torch.eye(sets.dim, dtype=target.dtype).expand(len(target), sets.dim, sets.dim)
         solution, multipliers = project_on_rows(sets.rows, sets.bounds, target, sets.name, sets.given_rows)
         return solution, metric, multipliers
     outside = (sets.depth(target) < 0.0).nonzero().squeeze(-1)
-    solution, metric = target.clone(), metric.clone()
+    solution = target.clone()
     multipliers = target.new_zeros(len(target), sets.rows.shape[1] + sets.matrix.shape[1])
     if len(outside) > 0:
-        solution[outside], metric[outside], multipliers[outside] = _project_curved(sets[outside], target[outside])
-    return solution, metric, multipliers
+        solution[outside], multipliers[outside] = _optimum(sets[outside], target[outside], linear=False)
+    return solution, _metric(sets, multipliers), multipliers
 
 
-def _project_curved(sets: _Sets, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    inside = _interior(sets)
-    distance = torch.linalg.vector_norm(target - inside, dim=-1, keepdim=True)
-    point, multipliers = _minimize(sets, inside, 1.0 / distance, (target - inside) / distance)
-    point, multipliers = _polish(sets, target, point, multipliers * distance)
-    return _pull_towards(sets, inside, point), _metric(sets, multipliers), multipliers
-
-
-def _polish(sets: _Sets, target: Tensor, point: Tensor, multipliers: Tensor) -> tuple[Tensor, Tensor]:
-    """Projections (n, d) of the targets, exact to rounding, and multipliers (n, m + k), from approximate ones."""
+def _optimum(sets: _Sets, aim: Tensor, linear: bool) -> tuple[Tensor, Tensor]:
+    """Of sets with ellipses, the points (n, d) with the largest product with `aim` (n, d) or, unless linear, those
+    nearest to it, exact to rounding, and the multipliers (n, m + k) of the latter."""
+    target, point, multipliers = _near_optimum(sets, aim, linear, _guess(sets))
     solution, exact, done = _newton(sets, target, point, multipliers)
     left = (~done).nonzero().squeeze(-1)
     if len(left) > 0:
-        solution[left], exact[left] = _sequential_programs(sets[left], target[left], point[left], multipliers[left])
+        # Raises where there is no interior.
+        part = sets[left]
+        inside = _interior(part)
+        target, point, multipliers = _near_optimum(part, aim[left], linear, inside)
+        point, exact[left] = _sequential_programs(part, target, point, multipliers)
+        solution[left] = _pull_towards(part, inside, point)
     return solution, exact
+
+
+def _near_optimum(sets: _Sets, aim: Tensor, linear: bool, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What to project for the optimum (n, d), an approximation of it and its multipliers (n, m + k)."""
+    if linear:
+        point, multipliers = _minimize(sets, start, torch.zeros_like(aim[:, :1]), aim)
+        # A step of the proximal point method: what is left of the error is its square over the step.
+        return point + _PROXIMAL_STEP * aim, point, _PROXIMAL_STEP * multipliers
+    distance = torch.linalg.vector_norm(aim - start, dim=-1, keepdim=True)
+    point, multipliers = _minimize(sets, start, 1.0 / distance, (aim - start) / distance)
+    return aim, point, distance * multipliers
 
 
 def _newton(sets: _Sets, target: Tensor, point: Tensor, multipliers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -364,16 +374,20 @@ def _pull_towards(sets: _Sets, inside: Tensor, point: Tensor) -> Tensor:
 
 
 def _interior(sets: _Sets) -> Tensor:
-    """Interior points (n, d) of sets with ellipses: the centre of a single ellipse without rows, the origin otherwise;
-    where that is not interior, the deepest point."""
-    alone = sets.matrix.shape[1] == 1 and sets.given_rows == 0
-    candidate = sets.center[:, 0] if alone else torch.zeros_like(sets.center[:, 0])
+    """Interior points (n, d) of sets with ellipses: the guess or, where that is not interior, the deepest point."""
+    candidate = _guess(sets)
     shallow = (sets.depth(candidate) <= _NEAR_BOUNDARY).nonzero().squeeze(-1)
     if len(shallow) == 0:
         return candidate
     candidate = candidate.clone()
     candidate[shallow] = _deepest(sets[shallow])
     return candidate
+
+
+def _guess(sets: _Sets) -> Tensor:
+    """Where an interior point (n, d) often is: the centre of a single ellipse without rows, the origin otherwise."""
+    alone = sets.matrix.shape[1] == 1 and sets.given_rows == 0
+    return sets.center[:, 0] if alone else torch.zeros_like(sets.center[:, 0])
 
 
 def _deepest(sets: _Sets) -> Tensor:
@@ -428,28 +442,19 @@ def _maximize_on_rows(sets: _Sets, slope: Tensor) -> Tensor:
     return project_on_rows(sets.rows, sets.bounds, solution, sets.name, sets.given_rows)[0]
 
 
-def _maximize_under_ellipses(sets: _Sets, slope: Tensor) -> Tensor:
-    inside = _interior(sets)
-    solution, multipliers = _minimize(sets, inside, torch.zeros_like(slope[:, :1]), slope)
-    # A step of the proximal point method: what is left of the error is its square over the step.
-    solution = _polish(sets, solution + _PROXIMAL_STEP * slope, solution, _PROXIMAL_STEP * multipliers)[0]
-    return _pull_towards(sets, inside, solution)
+def _minimize(sets: _Sets, start: Tensor, curvature: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """argmin a (n, d) of curvature |a - start|^2 / 2 - <gradient, a> over sets with ellipses, and the
+    multipliers (n, m + k), from the points `start`.
 
-
-def _minimize(sets: _Sets, inside: Tensor, curvature: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """argmin a (n, d) of curvature |a - inside|^2 / 2 - <gradient, a> over sets with ellipses, and the
-    multipliers (n, m + k), from the interior points `inside`.
-
-    Solved for y = size (a - inside), in which the smallest ellipse is of order 1.
+    Solved for y = size (a - start), in which the smallest ellipse is of order 1.
     """
     size = _size(sets)
-    bounds = size * (sets.bounds - _times(sets.rows, inside))
-    start = torch.zeros_like(inside)
-    matrix, offset = _cones(sets, inside, size)
-    point, dual, _ = minimize(curvature / size, gradient, sets.rows, bounds, matrix, offset, start)
+    bounds = size * (sets.bounds - _times(sets.rows, start))
+    matrix, offset = _cones(sets, start, size)
+    point, dual, _ = minimize(curvature / size, gradient, sets.rows, bounds, matrix, offset, torch.zeros_like(start))
     # In units of a; the ellipses' for the square of what the cone bounds, hence half.
     m = sets.rows.shape[1]
-    return inside + point / size, torch.cat((dual[:, :m], 0.5 * dual[:, m:] / size), -1)
+    return start + point / size, torch.cat((dual[:, :m], 0.5 * dual[:, m:] / size), -1)
 
 
 def _size(sets: _Sets) -> Tensor:

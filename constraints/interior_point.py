@@ -30,9 +30,9 @@ def minimize(
     """argmin y (n, d) of curvature |y|^2 / 2 - <gradient, y> subject to rows (n, m, d) @ y <= bounds (n, m) and
     u_0 >= |(u_1, ..., u_q)| for u = offset (n, k, 1 + q) - matrix (n, k, 1 + q, d) @ y.
 
-    curvature is (n, 1), gradient and the strictly feasible start are (n, d). The objective and constraints should be of
+    curvature is (n, 1), gradient and start, any point, are (n, d). The objective and constraints should be of
     order 1. Also returns the multipliers (n, m + k) of the rows and the u_0, and whether (n,) the method converged; where
-    it did not, the point is the best one of those it came to, which all are feasible.
+    it did not, the point is the best one of those it came to. From a strictly feasible start all points are feasible.
     """
     m, (k, q, dim) = rows.shape[1], matrix.shape[1:]
     count = len(rows)
@@ -49,6 +49,9 @@ def minimize(
     # On the central path but for the gradient: every slack times its multiplier is the set's size.
     point = start
     slack = limits - _times(stacked, point)
+    tail = torch.linalg.vector_norm(cones(slack)[..., 1:], dim=-1)
+    depth = torch.cat((slack[:, :m], slack[:, m::q] - tail), 1).amin(-1, keepdim=True)
+    slack = slack + torch.where(depth > 0.0, 0.0, 1.0 - depth) * unit
     cone = cones(slack)
     mirrored = torch.cat((cone[..., :1], -cone[..., 1:]), -1) / _size(cone).square()
     dual = slack.amax(-1, keepdim=True) * torch.cat((1.0 / slack[:, :m], mirrored.flatten(1)), 1)

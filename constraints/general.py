@@ -410,7 +410,7 @@ def _deepest(sets: _Sets) -> Tensor:
     gradient = torch.zeros_like(rows[:, 0])
     gradient[:, -1] = 1.0
     start = gradient * (size * sets.depth(origin).unsqueeze(-1)).clamp(max=0.0) - gradient
-    solution, _, converged = minimize(torch.zeros_like(size), gradient, rows, bounds, matrix, offset, start)
+    solution, _, converged = minimize(torch.zeros_like(size), gradient, rows, bounds, matrix, offset, start, 1e-12)
     solution = solution / size
     point = origin + solution[:, :-1]
     deep = sets.depth(point) > _NO_INTERIOR
@@ -451,7 +451,8 @@ def _minimize(sets: _Sets, start: Tensor, curvature: Tensor, gradient: Tensor) -
     size = _size(sets)
     bounds = size * (sets.bounds - _times(sets.rows, start))
     matrix, offset = _cones(sets, start, size)
-    point, dual, _ = minimize(curvature / size, gradient, sets.rows, bounds, matrix, offset, torch.zeros_like(start))
+    zero = torch.zeros_like(start)
+    point, dual, _ = minimize(curvature / size, gradient, sets.rows, bounds, matrix, offset, zero, 1e-9)
     # In units of a; the ellipses' for the square of what the cone bounds, hence half.
     m = sets.rows.shape[1]
     return start + point / size, torch.cat((dual[:, :m], 0.5 * dual[:, m:] / size), -1)

@@ -12,8 +12,7 @@ from torch import Tensor
 
 _MAX_STEPS = 60
 _PATIENCE = 8
-_GAP = 1e-12
-_RESIDUAL = 1e-10
+_RESIDUAL = 100.0  # allowed in proportion to the gap
 # A sample that stalls at the limits of its conditioning has converged if it came this near to the above.
 _ACCEPTED = 1e3
 
@@ -26,6 +25,7 @@ def minimize(
     matrix: Tensor,
     offset: Tensor,
     start: Tensor,
+    accuracy: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """argmin y (n, d) of curvature |y|^2 / 2 - <gradient, y> subject to rows (n, m, d) @ y <= bounds (n, m) and
     u_0 >= |(u_1, ..., u_q)| for u = offset (n, k, 1 + q) - matrix (n, k, 1 + q, d) @ y.
@@ -63,15 +63,15 @@ def minimize(
         infeasible = slack + _times(stacked, point) - limits
         gap = (slack * dual).sum(-1) / (m + k)
         residual = torch.maximum(stationary.abs().amax(-1), infeasible.abs().amax(-1))
-        error = torch.maximum(gap / _GAP, residual / _RESIDUAL)
+        error = torch.maximum(gap, residual / _RESIDUAL)
         better = error < least[sample]
         found = sample[better]
         best[found], best_dual[found], least[found], improved[found] = point[better], dual[better], error[better], number
         # What has not come nearer for a while, or is not finite any more, has reached the limit of its conditioning.
-        live = ((error > 1.0) & error.isfinite() & (number - improved[sample] < _PATIENCE)).nonzero().squeeze(-1)
+        live = ((least[sample] > accuracy) & error.isfinite() & (number - improved[sample] < _PATIENCE)).nonzero().squeeze(-1)
         if len(live) == 0:
             break
-        if len(live) < len(sample):
+        if len(live) <= 0.7 * len(sample):
             sample, point, slack, dual = sample[live], point[live], slack[live], dual[live]
             curvature, gradient, stacked, limits = curvature[live], gradient[live], stacked[live], limits[live]
             root, stationary, infeasible, gap = root[live], stationary[live], infeasible[live], gap[live]
@@ -105,7 +105,7 @@ def minimize(
         point = point + length * move
         slack = slack - length * (infeasible + _times(stacked, move))
         dual = dual + length * scaling.divide(dual_move.unsqueeze(-1)).squeeze(-1)
-    return best, torch.cat((best_dual[:, :m], best_dual[:, m::q]), 1), least <= _ACCEPTED
+    return best, torch.cat((best_dual[:, :m], best_dual[:, m::q]), 1), least <= _ACCEPTED * accuracy
 
 
 class _Scaling:

@@ -14,7 +14,7 @@ from constraints.errors import ConstraintError, SampleName
 # Rows whose part outside the span of the active ones is shorter than this count as dependent on them.
 _DEPENDENT = 1e-9
 # An excess that no step can remove up to this size is rounding, above it the set is empty.
-_EMPTY = 1e-8
+EMPTY = 1e-8
 
 
 def project_on_rows(
@@ -74,8 +74,8 @@ def project_on_rows(
         until_drop, leaving = ratio.min(-1)
         until_met = torch.where(dependent, torch.inf, over.clamp(min=0.0) / length)
         stuck = until_drop.isinf() & until_met.isinf()
-        if bool((stuck & (over > _EMPTY)).any()):
-            first = int((stuck & (over > _EMPTY)).nonzero()[0])
+        if bool((stuck & (over > EMPTY)).any()):
+            first = int((stuck & (over > EMPTY)).nonzero()[0])
             # The row that cannot be met or one of those in its way, the box's aside.
             conflict = [row for row in [int(entering[first]), *index[first].tolist()] if 0 <= row < named]
             which = f", row {conflict[0]}" if conflict else ""

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from constraints.active_set import project_on_rows
+from constraints.active_set import EMPTY, project_on_rows
 from constraints.base import Constraint, JacobianProduct, box_gauge_gradient, largest_gauge
 from constraints.errors import ConstraintError, SampleName, name_samples, require
 from constraints.interior_point import minimize
@@ -145,6 +145,10 @@ class GeneralConstraint(Constraint):
         count = math.prod(lead)
         rows = rows.expand(*lead, m, d).reshape(count, m, d).cpu()
         bounds = bounds.expand(*lead, m).reshape(count, m).cpu()
+        # What no point of the box meets; the face of it that a row just touches is left.
+        reach = rows.abs().sum(-1)
+        met = torch.where(reach > 0.0, bounds >= -reach - EMPTY, bounds >= 0.0)
+        require(met, "the set is empty", name_samples(tuple(lead)))
         # 0 <= 0 holds everywhere, with slack.
         bounds = torch.where((rows == 0.0).all(-1) & (bounds == 0.0), 1.0, bounds)
         faces = torch.eye(d, dtype=rows.dtype).expand(len(rows), d, d)
@@ -288,9 +292,7 @@ def _slack(sets: _Sets, point: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat((sets.bounds - _times(sets.rows, point), 1.0 - value), -1), torch.cat((sets.rows, gradient), 1)
 
 
-def _sequential_programs(
-    sets: _Sets, target: Tensor, point: Tensor, multipliers: Tensor
-) -> tuple[Tensor, Tensor]:
+def _sequential_programs(sets: _Sets, target: Tensor, point: Tensor, multipliers: Tensor) -> tuple[Tensor, Tensor]:
     """Sequential quadratic programming, which finds the active constraints by itself."""
     for _ in range(_POLISH_STEPS):
         root = torch.linalg.cholesky(_metric(sets, multipliers))
@@ -394,7 +396,6 @@ def _deepest(sets: _Sets) -> Tensor:
     """The points (n, d) with the largest t such that rows hold with slack t and ellipses, which are nonlinear in it,
     with slack t to first order from their boundary."""
     solid = sets.rows.abs().amax(-1, keepdim=True) > 0.0
-    require((sets.bounds >= 0.0) | solid.squeeze(-1), "the set is empty", sets.name)
     # Around the centre of the smallest ellipse, in its size, as in `_minimize`.
     traces = sets.matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
     size = _size(sets)
@@ -423,7 +424,6 @@ def _deepest(sets: _Sets) -> Tensor:
 def _chebyshev(sets: _Sets) -> Tensor:
     """Chebyshev centres (n, d) of sets without ellipses."""
     solid = sets.rows.abs().amax(-1, keepdim=True) > 0.0
-    require((sets.bounds >= 0.0) | solid.squeeze(-1), "the set is empty", sets.name)
     rows = torch.cat((sets.rows, solid.to(sets.rows.dtype)), -1)
     objective = torch.zeros(len(rows), sets.dim + 1, dtype=rows.dtype)
     objective[:, -1] = 1.0

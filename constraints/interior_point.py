@@ -31,8 +31,9 @@ def minimize(
     u_0 >= |(u_1, ..., u_q)| for u = offset (n, k, 1 + q) - matrix (n, k, 1 + q, d) @ y.
 
     curvature is (n, 1), gradient and start, any point, are (n, d). The objective and constraints should be of
-    order 1. Also returns the multipliers (n, m + k) of the rows and the u_0, and whether (n,) the method converged; where
-    it did not, the point is the best one of those it came to. From a strictly feasible start all points are feasible.
+    order 1. A sample ends where the mean product of slack and multiplier is `accuracy`. Also returns the multipliers
+    (n, m + k) of the rows and the u_0, and whether (n,) the method converged; where it did not, the point is the best
+    one of those it came to. From a strictly feasible start all points are feasible.
     """
     m, (k, q, dim) = rows.shape[1], matrix.shape[1:]
     count = len(rows)
@@ -66,9 +67,18 @@ def minimize(
         error = torch.maximum(gap, residual / _RESIDUAL)
         better = error < least[sample]
         found = sample[better]
-        best[found], best_dual[found], least[found], improved[found] = point[better], dual[better], error[better], number
+        best[found], best_dual[found], least[found], improved[found] = (
+            point[better],
+            dual[better],
+            error[better],
+            number,
+        )
         # What has not come nearer for a while, or is not finite any more, has reached the limit of its conditioning.
-        live = ((least[sample] > accuracy) & error.isfinite() & (number - improved[sample] < _PATIENCE)).nonzero().squeeze(-1)
+        live = (
+            ((least[sample] > accuracy) & error.isfinite() & (number - improved[sample] < _PATIENCE))
+            .nonzero()
+            .squeeze(-1)
+        )
         if len(live) == 0:
             break
         if len(live) <= 0.7 * len(sample):

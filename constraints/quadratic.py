@@ -12,6 +12,9 @@ from constraints.ellipse import ellipse_excess, ellipse_gauge_gradient
 from constraints.errors import name_samples, require
 from constraints.general import ON_BOUNDARY, GeneralConstraint, check_obs, checked
 
+# Asymmetry and negative eigenvalues of Q up to this share of its largest entry are rounding, in float32 too.
+_ROUNDING = 1e-6
+
 Coefficient = Callable[[Tensor], Tensor]
 
 
@@ -62,9 +65,13 @@ class QuadraticConstraint(GeneralConstraint):
         name = name_samples(tuple(matrix.shape[:-2]))
         largest = matrix.abs().flatten(-2).amax(-1)
         skew = (matrix - matrix.mT).abs().flatten(-2).amax(-1)
-        require((skew <= 1e-9 * largest).flatten(), "Q(obs) is not symmetric", name)
+        require((skew <= _ROUNDING * largest).flatten(), "Q(obs) is not symmetric", name)
+        matrix = 0.5 * (matrix + matrix.mT)
         least = torch.linalg.eigvalsh(matrix)[..., 0]
-        require((least >= -1e-9 * largest).flatten(), "Q(obs) is not positive semi-definite", name)
+        require((least >= -_ROUNDING * largest).flatten(), "Q(obs) is not positive semi-definite", name)
+        matrix = matrix + (-least).clamp(min=0.0)[..., None, None] * torch.eye(
+            self.dim, dtype=matrix.dtype, device=matrix.device
+        )
         require((bound > 0.0).flatten(), "bound(obs) is not positive", name_samples(tuple(bound.shape)))
         return matrix, center, bound
 

@@ -275,13 +275,16 @@ def _newton(sets: _Sets, target: Tensor, point: Tensor, multipliers: Tensor) -> 
         normals = normals.take_along_dim(slot.unsqueeze(-1), 1) * used.unsqueeze(-1)
         top = torch.cat((_metric(sets, multipliers), normals.mT), -1)
         system = torch.cat((top, torch.cat((normals, -idle), -1)), 1)
-        right = torch.cat((target - point, slack.gather(-1, slot) * used), -1)
+        # For the change of the multipliers: those of points far away are large, and so is their rounding.
+        held = multipliers.gather(-1, slot) * used
+        stationary = target - point - _times(normals.mT, held)
+        right = torch.cat((stationary, slack.gather(-1, slot) * used), -1)
         step = torch.linalg.solve_ex(system, right.unsqueeze(-1))[0].squeeze(-1)
         point = point + step[:, :d]
-        multipliers = torch.zeros_like(multipliers).scatter(-1, slot, step[:, d:] * used)
+        multipliers = torch.zeros_like(multipliers).scatter(-1, slot, held + step[:, d:] * used)
     # Newton's error is of the order of its last step's square.
     near = step[:, :d].abs().amax(-1) <= 1e-9
-    feasible = _slack(sets, point)[0].amin(-1) >= -1e-13
+    feasible = sets.depth(point) >= -1e-13
     right_set = (active.sum(-1) <= d) & (multipliers >= 0.0).all(-1)
     return point, multipliers, near & feasible & right_set
 

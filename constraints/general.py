@@ -2,10 +2,11 @@
 
 - Projection on rows alone: a dual active-set method, exact to rounding. It is several times faster than an OSQP loop,
   and stays exact for points far away, where OSQP stops converging.
-- Projection with ellipses: an interior-point method, then sequential quadratic programming with that active-set method
-  for its quadratic programs, which makes the interior-point solution exact and finds its active set.
+- Projection and linear oracle with ellipses: an interior-point method, then Newton's method on the constraints that it
+  found active, exact to rounding. Where that is not the solution, sequential quadratic programming with the active-set
+  method, from the deepest point.
 - Linear oracle and Chebyshev centre on rows alone: HiGHS, the whole batch as one block-diagonal linear program.
-- Linear oracle with ellipses, deepest point: the interior-point method.
+- Deepest point with ellipses: the interior-point method.
 
 All of it runs on the CPU in float64, wherever the tensors are.
 """
@@ -35,7 +36,7 @@ _NO_INTERIOR = 1e-9
 _ACTIVE = 1e-9
 _NEWTON_STEPS = 4
 _POLISH_STEPS = 10
-_PROXIMAL_STEP = 100.0
+_PROXIMAL_STEP = 1e4
 _LARGEST_PROGRAM = 20_000  # rows of one block-diagonal linear program
 
 
@@ -256,7 +257,7 @@ def _near_optimum(sets: _Sets, aim: Tensor, linear: bool, start: Tensor) -> tupl
         point, multipliers = _minimize(sets, start, torch.zeros_like(aim[:, :1]), aim)
         # A step of the proximal point method: what is left of the error is its square over the step.
         return point + _PROXIMAL_STEP * aim, point, _PROXIMAL_STEP * multipliers
-    distance = torch.linalg.vector_norm(aim - start, dim=-1, keepdim=True)
+    distance = torch.linalg.vector_norm(aim - start, dim=-1, keepdim=True).maximum(1.0 / _size(sets))
     point, multipliers = _minimize(sets, start, 1.0 / distance, (aim - start) / distance)
     return aim, point, distance * multipliers
 
@@ -396,8 +397,7 @@ def _guess(sets: _Sets) -> Tensor:
 
 
 def _deepest(sets: _Sets) -> Tensor:
-    """The points (n, d) with the largest t such that rows hold with slack t and ellipses, which are nonlinear in it,
-    with slack t to first order from their boundary."""
+    """The points (n, d) of the largest `depth`; a ConstraintError where that is none."""
     solid = sets.rows.abs().amax(-1, keepdim=True) > 0.0
     # Around the centre of the smallest ellipse, in its size, as in `_minimize`.
     traces = sets.matrix.diagonal(dim1=-2, dim2=-1).sum(-1)

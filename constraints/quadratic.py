@@ -24,7 +24,8 @@ class QuadraticConstraint(GeneralConstraint):
     Give Q, bound (a function or a number) and c (default: the origin), or override them in a subclass. `center` is c,
     or where c is not inside the box the point deepest in the set. Methods raise a ConstraintError that names the sample
     for NaN or infinite observations or coefficients, wrong shapes, a Q that is not positive semi-definite, a bound that
-    is not positive, and a set that is empty or without interior.
+    is not positive, and an empty set; `center` and what needs one also for a set without interior (nowhere deeper than
+    1e-9), `project` and `linear_oracle` only where such a set leaves no unique multipliers.
     """
 
     def __init__(

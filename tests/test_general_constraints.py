@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import math
 
 import cvxpy as cp
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 from torch import Tensor
@@ -183,13 +184,16 @@ def test_agrees_with_a_conic_solver(shape):
 
 @given(
     dim=st.integers(1, 20),
-    rows=st.integers(0, 12),
-    ellipses=st.integers(0, 2),
-    rank=st.integers(1, 6),
-    scale=st.sampled_from([1e-3, 0.1, 1.0, 100.0]),
+    rows=st.sampled_from([0, 0, 1, 3, 5, 12, 30, 50]),
+    ellipses=st.integers(0, 3),
+    rank=st.integers(1, 20),
+    scale=st.sampled_from([1e-4, 1e-3, 0.1, 1.0, 100.0, 1e4]),
     far=st.sampled_from([0.1, 1.0, 10.0, 1e3, 1e6]),
     seed=st.integers(0, 2**31),
 )
+# Thin slabs, at whose boundary an interior-point method may come to rest.
+@example(dim=4, rows=0, ellipses=1, rank=1, scale=1e-3, far=0.1, seed=0)
+@example(dim=4, rows=0, ellipses=3, rank=1, scale=1e-3, far=10.0, seed=59)
 def test_every_method_keeps_its_promise(dim, rows, ellipses, rank, scale, far, seed):
     constraint = random_set(dim, rows, ellipses or not rows, min(rank, dim), scale, seed, batch=2)
     obs = no_obs(2)
@@ -211,6 +215,10 @@ def test_every_method_keeps_its_promise(dim, rows, ellipses, rank, scale, far, s
     # No point of the set found by other means does better than the oracle's.
     extreme = constraint.linear_oracle(obs, target)
     assert constraint.violation(obs, extreme).max() <= 1e-10
+    # The slope is in the normal cone.
+    ahead = extreme + target / target.norm(dim=-1, keepdim=True)
+    for i in range(2):
+        assert Written(constraint, obs, i).projection_error(extreme[i].numpy(), ahead[i].numpy()) <= 1e-8
     for other in (projected, boundary, center):
         assert ((extreme - other) * target / far).sum(-1).min() >= -1e-7
 
@@ -352,6 +360,139 @@ def test_set_without_interior_still_projects():
         flat.center(obs)
 
 
+def linear(A, b) -> LinearConstraint:
+    return LinearConstraint(
+        2, lambda obs: torch.tensor(A, dtype=torch.float64), lambda obs: torch.tensor(b, dtype=torch.float64)
+    )
+
+
+def ball(radius: float, *center: float) -> QuadraticConstraint:
+    return QuadraticConstraint(
+        2, lambda obs: torch.eye(2), radius**2, lambda obs: torch.tensor(center, dtype=torch.float64)
+    )
+
+
+def slab(width: float) -> LinearConstraint:
+    """A diagonal slab of the width, so its half is the depth."""
+    b = math.sqrt(2.0) * width
+    return LinearConstraint(
+        2,
+        lambda obs: torch.tensor([[1.0, 1.0], [-1.0, -1.0]]),
+        lambda obs: torch.tensor([0.3, b - 0.3], dtype=torch.float64),
+    )
+
+
+@pytest.mark.parametrize(
+    "constraint, message",
+    [
+        (Intersection(slab(3e-9), ball(1.0, 0.0, 0.0)), None),
+        (Intersection(ball(0.3, 0.3 - 1e-8, 0.0), ball(0.3, -0.3, 0.0)), None),
+        (ball(1e-8, 0.3, 0.2), None),
+        (Intersection(slab(1e-9), ball(1.0, 0.0, 0.0)), "the set has no interior"),
+        (Intersection(slab(0.0), ball(1.0, 0.0, 0.0)), "the set has no interior"),
+        (Intersection(ball(0.3, 0.3, 0.0), ball(0.3, -0.3, 0.0)), "the set has no interior"),
+        (ball(0.5, 1.5, 0.0), "the set has no interior"),
+        (ball(1e-10, 0.3, 0.2), "the set has no interior"),
+        (Intersection(slab(-1e-6), ball(1.0, 0.0, 0.0)), "the set is empty"),
+        (Intersection(ball(0.3, 0.3 + 1e-6, 0.0), ball(0.3, -0.3, 0.0)), "the set is empty"),
+        (ball(1e6, 1e6 + 1.5, 0.0), "the set is empty"),
+    ],
+)
+def test_thin_sets_are_told_from_flat_and_empty_ones(constraint, message):
+    obs, action = no_obs(1), torch.tensor([[2.0, 0.7]], dtype=torch.float64)
+    centered, others = (constraint.alpha_map, constraint.radial_map), (constraint.project, constraint.linear_oracle)
+    if message is None:
+        for method in (*centered, *others):
+            assert constraint.violation(obs, method(obs, action)).max() <= 1e-12
+    else:
+        # A tiny ball has a projection all the same.
+        for method in centered if message == "the set has no interior" else (*centered, *others):
+            with pytest.raises(ConstraintError, match=f"sample 0: {message}"):
+                method(obs, action)
+
+
+def quadratic(Q, bound: float, center=(0.0, 0.0)) -> QuadraticConstraint:
+    return QuadraticConstraint(
+        2,
+        lambda obs: torch.tensor(Q, dtype=torch.float64),
+        bound,
+        lambda obs: torch.tensor(center, dtype=torch.float64),
+    )
+
+
+@pytest.mark.parametrize(
+    "constraint, plain",
+    [
+        (linear([[1e-12, 0.0], [0.0, 1e12]], [0.3e-12, 0.2e12]), linear([[1.0, 0.0], [0.0, 1.0]], [0.3, 0.2])),
+        (linear([[1e-200, 0.0], [1e300, 1e300]], [1.0, 0.3e300]), linear([[1.0, 1.0]], [0.3])),
+        (linear([[1.0, 1.0], [1.0, 1.0 + 1e-13], [2.0, 2.0]], [0.3, 0.3, 0.6]), linear([[1.0, 1.0]], [0.3])),
+        (linear([[0.0, 0.0], [1.0, 1.0]], [0.0, 0.3]), linear([[1.0, 1.0]], [0.3])),
+        (quadratic([[0.0, 0.0], [0.0, 0.0]], 1e-12), Intersection(Box(2))),
+        (quadratic([[1e-300, 0.0], [0.0, 0.0]], 1.0), Intersection(Box(2))),
+        (ball(1e6, 0.0, 0.0), Intersection(Box(2))),
+        (ball(1e6, 1e6 + 0.5, 0.0), linear([[-1.0, 0.0]], [-0.5])),
+        (quadratic([[1e12, 0.0], [0.0, 1e12]], 0.25e12), ball(0.5, 0.0, 0.0)),
+        (quadratic([[1e-12, 0.0], [0.0, 1e-12]], 0.25e-12), ball(0.5, 0.0, 0.0)),
+        (Intersection(ball(0.5, 0.0, 0.0), ball(0.5, 0.0, 0.0), Box(2)), ball(0.5, 0.0, 0.0)),
+        (Intersection(ball(0.5, 0.0, 0.0), ball(0.25, 0.25, 0.0)), ball(0.25, 0.25, 0.0)),
+    ],
+)
+def test_extreme_coefficients(constraint, plain):
+    action = torch.tensor([[2.0, 0.7], [-1.0, 0.3], [1e6, -3e5], [0.0, -1.1]], dtype=torch.float64)
+    obs, center = no_obs(), plain.center(no_obs())
+    # An ellipse as large as 1e6 is half a millionth off a half-space in the box.
+    close = dict(rtol=0.0, atol=1e-6 if isinstance(plain, LinearConstraint) and constraint.explicit(obs)[2] else 1e-10)
+    torch.testing.assert_close(constraint.project(obs, action), plain.project(obs, action), **close)
+    slope = action / action.norm(dim=-1, keepdim=True)
+    best = [(each.linear_oracle(obs, slope) * slope).sum(-1) for each in (constraint, plain)]
+    torch.testing.assert_close(best[0], best[1], **close)
+    mapped = [each.alpha_map(obs, action, center) for each in (constraint, plain)]
+    torch.testing.assert_close(mapped[0], mapped[1], **close)
+
+
+def test_rounding_of_a_single_precision_matrix_is_no_error():
+    axis = torch.tensor([0.1, 0.7, 0.3])
+    root = torch.outer(axis, axis)  # its least eigenvalue is about -1e-8
+    constraint = QuadraticConstraint(3, lambda obs: root, 0.01)
+    obs, action = no_obs(1), torch.tensor([[0.1, 0.9, 0.2]], dtype=torch.float64)
+    # The slab |axis . a| <= 0.1.
+    normal = axis.double()
+    expected = action - (action @ normal - 0.1)[:, None] * normal / normal.square().sum()
+    torch.testing.assert_close(constraint.project(obs, action), expected, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(3, 4, 0, 1, 1.0), (3, 4, 2, 3, 1.0)], ids=str)
+def test_nothing_is_kept_or_changed(shape):
+    constraint, obs = random_set(*shape, seed=0), no_obs()
+    action = 2.0 * torch.randn(4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    action.requires_grad_()
+    rows, bounds, ellipses = constraint.explicit(obs)
+    inputs = [obs, action, rows, bounds, *(part for ellipse in ellipses for part in ellipse)]
+    before = [each.detach().clone() for each in inputs]
+
+    def use():
+        for method in (constraint.project, constraint.alpha_map, constraint.radial_map):
+            torch.autograd.grad(method(obs, action).sum(), action)
+        constraint.gauge(obs, action, constraint.center(obs)).sum().backward()
+        constraint.linear_oracle(obs, action)
+        action.grad = None
+
+    def tensors() -> int:
+        return sum(issubclass(type(each), Tensor) for each in gc.get_objects())
+
+    use()
+    gc.collect()
+    gc.disable()
+    try:
+        count = tensors()
+        use()
+        assert tensors() == count  # freed by counting references, without the collector's help
+    finally:
+        gc.enable()
+    for each, copy in zip(inputs, before, strict=True):
+        assert torch.equal(each, copy) and each._version == 0
+
+
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-12)])
 @pytest.mark.parametrize("constraint", [Barrier(), Disc(2), Intersection(Barrier(), Disc(2), Box(2))])
 def test_shapes_and_dtypes(constraint, dtype, tolerance):
@@ -391,10 +532,6 @@ def test_broken_action_stays_visible():
             assert result[:2].isnan().any(-1).all() and result[2].isfinite().all()
 
 
-def linear(A, b) -> LinearConstraint:
-    return LinearConstraint(2, lambda obs: torch.tensor(A, dtype=torch.float64), lambda obs: torch.tensor(b))
-
-
 NO_CENTER = torch.zeros(1, 2, dtype=torch.float64)
 
 
@@ -414,6 +551,7 @@ def all_methods(constraint: Constraint, obs: Tensor):
         (linear([[[1.0, 0.0]], [[1.0, 0.0]]], [[1.0], [-2.0]]), "sample 1.*"),
         (linear([[1.0, 0.0], [0.0, 0.0]], [1.0, -1.0]), "sample 0.*"),
         (linear([[1.0, 0.0], [-1.0, 0.0]], [-0.2, -0.2]), "sample 0.*"),
+        (linear([[1.0, 0.0], [1e-200, 0.0]], [1.0, -1.0]), "sample 0, row 1"),
         (linear([[1.0, math.nan]], [1.0]), r"A\(obs\) is NaN or infinite"),
         (linear([[1.0, 0.0]], [math.inf]), r"b\(obs\) is NaN or infinite"),
         (linear([[1.0, 0.0, 0.0]], [1.0]), r"A\(obs\) has shape \(1, 3\), expected \(\.\.\., m, 2\)"),

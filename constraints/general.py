@@ -36,7 +36,7 @@ _NO_INTERIOR = 1e-9
 _ACTIVE = 1e-9
 _NEWTON_STEPS = 4
 _POLISH_STEPS = 10
-_PROXIMAL_STEP = 1e4
+_PROXIMAL_STEP = 1e3
 _LARGEST_PROGRAM = 20_000  # rows of one block-diagonal linear program
 
 
@@ -285,7 +285,7 @@ def _newton(sets: _Sets, target: Tensor, point: Tensor, multipliers: Tensor) -> 
         multipliers = torch.zeros_like(multipliers).scatter(-1, slot, held + step[:, d:] * used)
     # Newton's error is of the order of its last step's square.
     near = step[:, :d].abs().amax(-1) <= 1e-9
-    feasible = sets.depth(point) >= -1e-13
+    feasible = sets.depth(point) >= -1e-12
     right_set = (active.sum(-1) <= d) & (multipliers >= 0.0).all(-1)
     return point, multipliers, near & feasible & right_set
 

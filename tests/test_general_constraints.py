@@ -215,7 +215,7 @@ def test_every_method_keeps_its_promise(dim, rows, ellipses, rank, scale, far, s
     # No point of the set found by other means does better than the oracle's.
     extreme = constraint.linear_oracle(obs, target)
     assert constraint.violation(obs, extreme).max() <= 1e-10
-    # The slope is in the normal cone, but for what a proximal step of 1e4 leaves; the loss is its square times 1e4 / 2.
+    # The slope is in the normal cone, but for what a proximal step of 1e3 leaves; the loss is its square times 500.
     ahead = extreme + target / target.norm(dim=-1, keepdim=True)
     for i in range(2):
         assert Written(constraint, obs, i).projection_error(extreme[i].numpy(), ahead[i].numpy()) <= 1e-7

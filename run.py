@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import torch
 
 import envs
 from algos import ALGORITHMS, NFWPO
+from constraints import ConstraintError
+from core.checkpoint import Checkpoint, CheckpointFolder, choose
 from core.config import (
     Config,
     ConfigError,
@@ -22,7 +27,20 @@ from core.config import (
     saved_settings,
     split_names,
 )
-from core.results import RunWriter, describe_environment, is_finished, read_run, run_folder, variant_name
+from core.interrupt import Interrupted, Interrupts
+from core.lock import LockedError, run_lock
+from core.results import (
+    RunWriter,
+    describe_environment,
+    describe_failure,
+    has_ended,
+    has_failed,
+    lockstep_group,
+    one_line,
+    read_run,
+    run_folder,
+    variant_name,
+)
 from core.trainer import Trainer
 from envs import TASKS
 
@@ -85,7 +103,13 @@ def _paper_config(name: str, task: str) -> Config:
     )
 
 
-def make_trainer(config: Config, seeds: list[int], writers: Sequence[RunWriter], progress: bool = True) -> Trainer:
+def make_trainer(
+    config: Config,
+    seeds: list[int],
+    writers: Sequence[RunWriter],
+    progress: bool = True,
+    check: Callable[[], None] = lambda: None,
+) -> Trainer:
     """The trainer of one cell: its environments and its agent put together; one writer a seed."""
     algorithm = ALGORITHMS[config.algo]
     train_envs = [envs.make(config.env) for _ in seeds]
@@ -97,62 +121,139 @@ def make_trainer(config: Config, seeds: list[int], writers: Sequence[RunWriter],
         mapping=algorithm.mapping,
         placement=algorithm.placement,
     )
-    return Trainer(config, agent, train_envs, lambda: envs.make(config.env), writers, progress)
+    return Trainer(config, agent, train_envs, lambda: envs.make(config.env), writers, progress, check)
 
 
-def train(config: Config, base: Config) -> None:
-    """Run the seeds of one cell that have no finished run, and say what came out and where it is."""
+def train(config: Config, base: Config, check: Callable[[], None] = lambda: None) -> bool:
+    """Run the seeds of one cell that have not ended, from their checkpoints where there are any, and say what came out
+    and where it is. Whether all seeds have a result."""
     torch.set_num_threads(config.threads)
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     variant = variant_name(config.algo, differences(config, base))
-    folders = {}
-    for seed in parse_seeds(config.seed):
-        folder = run_folder(config.results, config.env, variant, seed)
-        if is_finished(folder) and not config.overwrite:
-            print(f"{folder}: already finished{_result_of(folder)} (overwrite=true runs it again and keeps the old)")
-        else:
-            folders[seed] = folder
-    if not folders:
-        return
+    folders = {seed: run_folder(config.results, config.env, variant, seed) for seed in parse_seeds(config.seed)}
+    with ExitStack() as locks:
+        for folder in folders.values():
+            locks.enter_context(run_lock(folder))
+        ended = {seed for seed, folder in folders.items() if has_ended(folder) and not config.overwrite}
+        for seed in sorted(ended):
+            print(f"{folders[seed]}: {_end_of(folders[seed])} (overwrite=true starts it again and keeps this one)")
+        groups, fresh = ([], list(folders)) if config.overwrite else _find_checkpoints(folders, ended)
+        info = describe_environment(["run.py", *sys.argv[1:]]) | {"threads": config.threads, "device": "cpu"}
+        for group in groups:
+            if ended.issuperset(group):  # the process died when all was done
+                for seed in group:
+                    CheckpointFolder(folders[seed]).remove()
+            else:
+                _resume(config, folders, group, ended, info, check)
+        if fresh:
+            info["lockstep"] = fresh
+            writers = [
+                RunWriter(
+                    folders[seed],
+                    saved_settings(config, seed),
+                    info,
+                    config.eval_episodes,
+                    replace_finished=config.overwrite,
+                )
+                for seed in fresh
+            ]
+            _run(make_trainer(config, fresh, writers, check=check))
+        return not any(has_failed(folder) for folder in folders.values())
 
-    info = describe_environment(["run.py", *sys.argv[1:]])
-    writers = [
-        RunWriter(folder, saved_settings(config, seed), info, config.eval_episodes, replace_finished=config.overwrite)
-        for seed, folder in folders.items()
-    ]
+
+def _find_checkpoints(folders: dict[int, Path], ended: set[int]) -> tuple[list[dict[int, Checkpoint]], list[int]]:
+    """The seeds to take up together, each with its checkpoint, and those to start from the beginning."""
+    intact, started = {}, {}
+    for seed, folder in folders.items():
+        checkpoints, problems = CheckpointFolder(folder).read()
+        for problem in problems:
+            print(problem, file=sys.stderr)
+        if checkpoints or seed not in ended:
+            intact[seed] = checkpoints
+            started[seed] = checkpoints[0].group if checkpoints else lockstep_group(folder)
+    groups, fresh = choose(intact, started)
+    return groups, [seed for seed in fresh if seed not in ended]
+
+
+def _resume(
+    config: Config,
+    folders: dict[int, Path],
+    group: dict[int, Checkpoint],
+    ended: set[int],
+    info: dict[str, Any],
+    check: Callable[[], None],
+) -> None:
+    """Train on from the checkpoints of `group`, which are of one moment."""
+    before = next(iter(group.values())).group
+    # Seeds that have ended ride along, so that the batch is what it was; with others missing there is no use in that.
+    seeds = list(before) if set(before) == set(group) else [seed for seed in group if seed not in ended]
+    writers = []
+    for seed in seeds:
+        checkpoint, settings = group[seed], saved_settings(config, seed)
+        for key in settings.keys() - {"threads", "checkpoint_every"}:
+            if checkpoint.settings.get(key) != settings[key]:
+                raise ConfigError(
+                    f"{folders[seed]} was started with {key}={checkpoint.settings.get(key)}, which is {settings[key]}"
+                    " now; overwrite=true starts it again and keeps the old one"
+                )
+    for seed in seeds:
+        resumed = info | {"step": group[seed].step, "lockstep": seeds}
+        writers.append(RunWriter.resume(folders[seed], saved_settings(config, seed), resumed, config.eval_episodes))
+        if seed not in ended:
+            print(f"{folders[seed]}: resuming from step {group[seed].step}")
+    if len(seeds) < len(before):
+        print(f"(trained with other seeds before, {len(before)} in all: equal up to rounding to an unbroken run)")
+    trainer = make_trainer(config, seeds, writers, check=check)
+    trainer.restore([group[seed] for seed in seeds])
+    _run(trainer)
+
+
+def _run(trainer: Trainer) -> None:
     try:
-        results = make_trainer(config, list(folders), writers).run()
-    except KeyboardInterrupt:
-        print(f"\ninterrupted; unfinished runs stay in {writers[0].folder.parent}", file=sys.stderr)
-        raise
-    for writer, result in zip(writers, results, strict=True):
+        results = trainer.run()
+    except (Interrupted, KeyboardInterrupt):
         print(
-            f"{writer.folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
-            f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e})"
+            f"\ninterrupted at step {max(trainer.steps)}; the same command resumes"
+            f" (unfinished runs are in {trainer.writers[0].folder.parent})",
+            file=sys.stderr,
         )
+        raise
+    for i, (writer, result) in enumerate(zip(trainer.writers, results, strict=True)):
+        if result is None:
+            print(f"{writer.folder}: {describe_failure(trainer.failures[i])}", file=sys.stderr)
+        else:
+            print(
+                f"{writer.folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
+                f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e})"
+            )
 
 
-def _result_of(folder: Path) -> str:
+def _end_of(folder: Path) -> str:
     try:
-        return f", return {read_run(folder).result['return_mean']:.2f}"
+        run = read_run(folder)
     except ValueError as error:
-        return f", but unreadable ({error})"
+        return f"already finished, but unreadable ({error})"
+    if run.failure:
+        return describe_failure(run.failure)
+    return f"already finished, return {run.result['return_mean']:.2f}"
 
 
 def main(arguments: list[str]) -> int:
-    """Exit code: 0 done, 2 bad input, 130 interrupted."""
+    """Exit code: 0 done, 2 bad input, 3 a seed diverged, 130 or 143 interrupted by SIGINT or SIGTERM."""
     if not arguments or {"-h", "--help", "help"} & set(arguments):
         print(usage())
         return 0
     try:
-        for config, base in plan(arguments):
-            train(config, base)
-    except (ConfigError, OSError) as error:
-        print(f"run.py: {error}", file=sys.stderr)
+        with Interrupts() as interrupts:
+            done = [train(config, base, interrupts.check) for config, base in plan(arguments)]
+    except (ConfigError, ConstraintError, LockedError, OSError) as error:
+        print(f"run.py: {one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        return 130
-    return 0
+        return 128 + signal.SIGINT
+    except Interrupted as interrupted:
+        return 128 + interrupted.signum
+    return 0 if all(done) else 3
 
 
 if __name__ == "__main__":

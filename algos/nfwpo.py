@@ -17,10 +17,10 @@ class NFWPO(TD3):
     """TD3 whose actor regresses on Frank-Wolfe reference actions."""
 
     def actor_loss(self, batch: Batch) -> Tensor:
-        """|mu(s) - a_s|^2, no gradient through a_s: mean over the batch, sum over seeds."""
+        """|mu(s) - a_s|^2, no gradient through a_s, mean over the batch: (seeds,)."""
         suggested = self.suggest(self.actor, batch.obs)
         reference = self.reference_action(batch.obs, suggested.detach())
-        return (suggested - reference).square().sum(-1).mean(-1).sum()
+        return (suggested - reference).square().sum(-1).mean(-1)
 
     def reference_action(self, obs: Tensor, suggested: Tensor) -> Tensor:
         """a_s = P_s(mu(s) + alpha (c_s - P_s(mu(s)))), c_s = argmax over the set of <c, grad_a Q_1(s, P_s(mu(s)))>."""

@@ -14,11 +14,12 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
+from torch.optim import Optimizer
 
 from constraints import Constraint
 from core.agent import Agent, MapName, Placement
 from core.config import Config
-from core.networks import MLP, TwinCritic, adam, descend, frozen_copy, rows_of, soft_update
+from core.networks import MLP, TwinCritic, adam, frozen_copy, rows_of, soft_update
 from core.random import Streams
 from core.replay import Batch
 
@@ -105,7 +106,7 @@ class SAC(Agent):
         self.target_entropy = -float(self.action_dim)
         self.unit_ball = config.entropy == "ball"
         self.rollout_noise = torch.zeros(len(seeds), *self.actor.noise_shape)
-        self.entropy: Tensor | None = None  # of the policy at the last batch's states
+        self.entropy = torch.zeros(len(seeds), 1)  # of the policy at the last batch's states
 
     def networks(self) -> dict[str, nn.Module]:
         return {
@@ -114,6 +115,16 @@ class SAC(Agent):
             "critic_target": self.critic_target,
             "temperature": self.temperature,
         }
+
+    def optimizers(self) -> dict[str, Optimizer]:
+        return {
+            "actor": self.actor_optimizer,
+            "critic": self.critic_optimizer,
+            "temperature": self.temperature_optimizer,
+        }
+
+    def memory(self) -> dict[str, Tensor]:
+        return {"rollout_noise": self.rollout_noise, "entropy": self.entropy}
 
     def start_rollout(self, only: Sequence[int]) -> None:
         """gSDE keeps one theta for a rollout."""
@@ -169,22 +180,20 @@ class SAC(Agent):
         alpha = self.temperature.log_alpha.detach().exp()
         self.entropy = -log_prob.detach().mean(-1, keepdim=True)
         surplus = self.target_entropy - self.entropy
-        descend(self.temperature_optimizer, -(self.temperature.log_alpha * surplus).sum())
+        self.descend("temperature", -(self.temperature.log_alpha * surplus)[:, 0])
 
         with torch.no_grad():
             next_action, next_log_prob, _ = self.sample(batch.next_obs, batch.next_center, next_noise)
             next_value = self.critic_target(batch.next_obs, next_action).amin(0) - alpha * next_log_prob
             q_target = batch.reward + self.config.gamma * (1 - batch.terminated) * next_value
         q = self.critic(batch.obs, batch.action)
-        descend(self.critic_optimizer, 0.5 * (q - q_target).square().mean(-1).sum())
+        self.descend("critic", 0.5 * (q - q_target).square().mean(-1))
 
         value = self.critic(batch.obs, action).amin(0) - alpha * log_prob
-        descend(self.actor_optimizer, (self.penalty(batch.obs, suggested) - value).mean(-1).sum())
+        self.descend("actor", (self.penalty(batch.obs, suggested) - value).mean(-1))
         soft_update(self.critic_target, self.critic, self.config.tau)
 
     def statistics(self) -> dict[str, Tensor]:
-        if self.entropy is None:
-            return {}
         return {"temperature": self.temperature.log_alpha.detach().exp()[:, 0], "entropy": self.entropy[:, 0]}
 
     def draw_noise(self, batch: Batch) -> tuple[Tensor, Tensor]:

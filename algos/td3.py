@@ -11,11 +11,12 @@ from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from constraints import Constraint
 from core.agent import Agent, MapName, Placement
 from core.config import Config
-from core.networks import MLP, TwinCritic, adam, descend, frozen_copy, rows_of, soft_update
+from core.networks import MLP, TwinCritic, adam, frozen_copy, rows_of, soft_update
 from core.random import Streams
 from core.replay import Batch
 
@@ -40,7 +41,6 @@ class TD3(Agent):
         self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
         self.actor_optimizer = adam(self.actor.parameters(), config.learning_rate)
         self.critic_optimizer = adam(self.critic.parameters(), config.learning_rate)
-        self.updates = 0
 
     def networks(self) -> dict[str, nn.Module]:
         return {
@@ -49,6 +49,9 @@ class TD3(Agent):
             "actor_target": self.actor_target,
             "critic_target": self.critic_target,
         }
+
+    def optimizers(self) -> dict[str, Optimizer]:
+        return {"actor": self.actor_optimizer, "critic": self.critic_optimizer}
 
     def suggest(self, actor: MLP, obs: Tensor) -> Tensor:
         """mu(s): the action before the map, in the box where a projection follows."""
@@ -73,11 +76,11 @@ class TD3(Agent):
         """A step of both critics and, every `policy_delay` steps, of the actor and the targets."""
         q_target = self.bootstrap(batch)
         q = self.critic(batch.obs, batch.action)
-        descend(self.critic_optimizer, (q - q_target).square().mean(-1).sum())
+        self.descend("critic", (q - q_target).square().mean(-1))
 
         self.updates += 1
         if self.updates % self.config.policy_delay == 0:
-            descend(self.actor_optimizer, self.actor_loss(batch))
+            self.descend("actor", self.actor_loss(batch))
             soft_update(self.actor_target, self.actor, self.config.tau)
             soft_update(self.critic_target, self.critic, self.config.tau)
 
@@ -100,10 +103,10 @@ class TD3(Agent):
         return self.pull_back(batch.next_obs, action, batch.next_center)
 
     def actor_loss(self, batch: Batch) -> Tensor:
-        """-Q_1 at the actor's action plus the penalty: mean over the batch, sum over seeds."""
+        """-Q_1 at the actor's action plus the penalty, mean over the batch: (seeds,)."""
         suggested = self.suggest(self.actor, batch.obs)
         action = suggested
         if self.placement == "layer":
             action = self.feasible(batch.obs, suggested, batch.center)
         q = self.critic.first(batch.obs, action)
-        return (self.penalty(batch.obs, suggested) - q).mean(-1).sum()
+        return (self.penalty(batch.obs, suggested) - q).mean(-1)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Literal
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from constraints import Constraint
 from core.config import Config
+from core.networks import descend
 from core.random import Streams
 from core.replay import Batch
 
@@ -45,6 +48,8 @@ class Agent(ABC):
         self.mapping, self.placement = mapping, placement
         self.exploration = Streams(seeds, "explore")
         self.update_noise = Streams(seeds, "update")
+        self.updates = 0  # gradient steps so far, where an algorithm counts them
+        self.diverged: dict[int, str] = {}  # position of a seed -> what was not finite in a gradient step
 
     @property
     def bounded(self) -> bool:
@@ -85,6 +90,10 @@ class Agent(ABC):
         """The learned modules; each parameter's leading axis holds the seeds, once or (twin critics) twice."""
 
     @abstractmethod
+    def optimizers(self) -> dict[str, Optimizer]:
+        """The optimisers, under the names that `descend` takes."""
+
+    @abstractmethod
     def explore(self, obs: Tensor, only: Sequence[int]) -> Tensor:
         """Suggestions (seeds, d) with exploration noise, for obs (seeds, n). Only the rows `only` count."""
 
@@ -96,25 +105,101 @@ class Agent(ABC):
     def update(self, batch: Batch) -> None:
         """One gradient step of every seed."""
 
-    def statistics(self) -> dict[str, Tensor]:
-        """What the last gradient step tells about the state of training: name -> (seeds,). Empty before the first."""
+    def memory(self) -> dict[str, Tensor]:
+        """What else the future depends on: tensors (seeds, ...), beyond networks, optimisers and random streams."""
         return {}
+
+    def statistics(self) -> dict[str, Tensor]:
+        """What the last gradient step tells about the state of training: name -> (seeds,)."""
+        return {}
+
+    def descend(self, name: str, losses: Tensor) -> None:
+        """One step of the optimiser `name` on the sum of `losses` (..., seeds); `diverged` notes those not finite."""
+        loss = losses.sum()
+        descend(self.optimizers()[name], loss)
+        if not math.isfinite(loss.item()):
+            finite = losses.detach().isfinite().reshape(-1, len(self.seeds)).all(0)
+            for i in (~finite).nonzero().flatten().tolist():
+                self.diverged.setdefault(i, f"{name} loss")
 
     @torch.no_grad()
     def state(self, i: int) -> dict[str, Tensor]:
         """A copy of the parameters of the seed in position i."""
-        return {
-            name: parameter.view(-1, len(self.seeds), *parameter.shape[1:])[:, i].clone()
-            for name, parameter in self._parameters()
-        }
+        return {name: self._rows(parameter)[:, i].clone() for name, parameter in self._parameters()}
 
     @torch.no_grad()
     def load_state(self, i: int, state: dict[str, Tensor]) -> None:
         """Put what `state` returned back into position i."""
         for name, parameter in self._parameters():
-            parameter.view(-1, len(self.seeds), *parameter.shape[1:])[:, i] = state[name]
+            self._rows(parameter)[:, i] = state[name]
 
-    def _parameters(self):
+    @torch.no_grad()
+    def training_state(self, i: int) -> dict[str, Any]:
+        """A copy of all that the seed in position i needs to train on exactly as it would have."""
+        optimizers = {}
+        for name, optimizer in self.optimizers().items():
+            for number, parameter in enumerate(_parameters_of(optimizer)):
+                for key, value in optimizer.state[parameter].items():
+                    # Adam's moments have a row a seed, its step count is one for all.
+                    rows = self._rows(value)[:, i] if value.dim() else value
+                    optimizers[f"{name}.{number}.{key}"] = rows.clone()
+        return {
+            "parameters": self.state(i),
+            "optimizers": optimizers,
+            "memory": {name: tensor[i].clone() for name, tensor in self.memory().items()},
+            "streams": {name: streams.generators[i].get_state() for name, streams in self._streams().items()},
+            "updates": self.updates,
+        }
+
+    @torch.no_grad()
+    def load_training_state(self, i: int, state: dict[str, Any]) -> None:
+        """Put what `training_state` returned back into position i. All seeds must have taken as many updates."""
+        self.load_state(i, state["parameters"])
+        for key, saved in state["optimizers"].items():
+            name, number, quantity = key.split(".")
+            optimizer = self.optimizers()[name]
+            parameter = _parameters_of(optimizer)[int(number)]
+            if quantity not in optimizer.state[parameter]:
+                optimizer.state[parameter][quantity] = torch.zeros_like(parameter) if saved.dim() else saved.clone()
+            if saved.dim():
+                self._rows(optimizer.state[parameter][quantity])[:, i] = saved
+        for name, tensor in self.memory().items():
+            tensor[i] = state["memory"][name]
+        for name, streams in self._streams().items():
+            streams.generators[i].set_state(state["streams"][name])
+        self.updates = state["updates"]
+
+    @torch.no_grad()
+    def clear(self, i: int) -> None:
+        """Set the parameters of position i and its optimisers' moments to zero: a diverged seed, out of harm's way."""
+        for _, parameter in self._parameters():
+            self._rows(parameter)[:, i] = 0.0
+        for optimizer in self.optimizers().values():
+            for parameter in _parameters_of(optimizer):
+                for value in optimizer.state[parameter].values():
+                    if value.dim():
+                        self._rows(value)[:, i] = 0.0
+
+    @torch.no_grad()
+    def infinite_parameter(self, i: int) -> str | None:
+        """The name of a parameter of position i that is not finite, None where all are."""
+        for name, parameter in self._parameters():
+            if not self._rows(parameter)[:, i].isfinite().all():
+                return name
+        return None
+
+    def _parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
         for module_name, module in self.networks().items():
             for name, parameter in module.named_parameters():
                 yield f"{module_name}.{name}", parameter
+
+    def _rows(self, tensor: Tensor) -> Tensor:
+        """View (1 or 2, seeds, ...) of a parameter, or of a tensor of its shape."""
+        return tensor.view(-1, len(self.seeds), *tensor.shape[1:])
+
+    def _streams(self) -> dict[str, Streams]:
+        return {"exploration": self.exploration, "update_noise": self.update_noise}
+
+
+def _parameters_of(optimizer: Optimizer) -> list[nn.Parameter]:
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]

@@ -59,11 +59,12 @@ class Config:
     final_episodes: int = field(default=50, metadata={"help": "episodes of the final result"})
     # The run itself; none of these changes what is learned, beyond float rounding.
     results: str = field(default="results", metadata={"help": "folder that results go to"})
-    overwrite: bool = field(default=False, metadata={"help": "run a finished run again; the old one is kept"})
+    overwrite: bool = field(default=False, metadata={"help": "start again in any case; the old run is kept"})
     threads: int = field(default=1, metadata={"help": "CPU threads of PyTorch"})
+    checkpoint_every: int = field(default=10_000, metadata={"help": "environment steps of a seed between checkpoints"})
 
 
-RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "threads")
+RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "threads", "checkpoint_every")
 """Settings that do not make a run another experiment: they never show in a run's name."""
 
 TD3_CONSTANTS = {"policy_delay": 2, "target_noise": 0.2, "target_noise_clip": 0.5}
@@ -228,7 +229,8 @@ def _check_ranges(config: Config) -> None:
     for key, value in asdict(config).items():
         if isinstance(value, float):
             demand(key, math.isfinite(value), "must be finite")
-    for key in ("steps", "batch_size", "buffer_size", "eval_every", "eval_episodes", "final_episodes", "threads"):
+    counts = ("steps", "batch_size", "buffer_size", "eval_every", "eval_episodes", "final_episodes")
+    for key in (*counts, "threads", "checkpoint_every"):
         demand(key, getattr(config, key) >= 1, "must be at least 1")
     for key in ("learning_starts", "action_noise", "target_noise", "target_noise_clip", "penalty", "log_det_floor"):
         demand(key, (getattr(config, key) or 0) >= 0, "must not be negative")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -10,20 +11,41 @@ import torch
 from torch import Tensor
 
 from core.random import stream_seed
+from envs import InfeasibleActionError
 
 
 class Evaluator:
-    """Owns `parallel` environments a seed, made when first needed; their random streams belong to the seed."""
+    """Owns `parallel` environments a seed, made when first needed; their random streams belong to the seed.
 
-    def __init__(self, make_env: Callable[[], gymnasium.Env], seeds: Sequence[int], parallel: int):
-        self.make_env, self.seeds, self.parallel = make_env, seeds, parallel
-        self.envs: dict[int, list[gymnasium.Env]] = {}
+    `check` is called before every step. Whatever it or something else raises, the environments' random streams are
+    put back, so that the evaluation can be made again.
+    """
+
+    def __init__(
+        self,
+        make_env: Callable[[], gymnasium.Env],
+        seeds: Sequence[int],
+        parallel: int,
+        check: Callable[[], None],
+    ):
+        self.make_env, self.seeds, self.parallel, self.check = make_env, seeds, parallel, check
+        self.envs: dict[int, list[Any]] = {}
+        self.refused: dict[int, str] = {}  # position of a seed -> why its policy's action was refused, in the last run
 
     def run(self, policy: Callable[[Tensor], Tensor], which: Sequence[int], episodes: int) -> np.ndarray:
-        """Returns (len(which), episodes) of `policy`, which maps obs (len(which), m, n) to feasible actions."""
-        returns = []
-        for start in range(0, episodes, self.parallel):
-            returns.append(self._together(policy, which, min(self.parallel, episodes - start)))
+        """Returns (len(which), episodes) of `policy`, which maps obs (len(which), m, n) to feasible actions.
+
+        NaN where the environment refused an action.
+        """
+        returns, self.refused = [], {}
+        before = {i: [env.unwrapped.get_state() for env in self._envs_of(i)] for i in which}
+        try:
+            for start in range(0, episodes, self.parallel):
+                returns.append(self._together(policy, which, min(self.parallel, episodes - start)))
+        except BaseException:
+            for i, states in before.items():
+                self.set_state(i, states)
+            raise
         return np.concatenate(returns, axis=1)
 
     def _together(self, policy: Callable[[Tensor], Tensor], which: Sequence[int], count: int) -> np.ndarray:
@@ -32,26 +54,42 @@ class Evaluator:
         returns = np.zeros((len(which), count))
         running = [(i, j) for i in range(len(which)) for j in range(count)]
         while running:
+            self.check()
             actions = policy(torch.from_numpy(obs)).numpy()
             still_running = []
             for i, j in running:
-                obs[i, j], reward, terminated, truncated, _ = envs[i][j].step(actions[i, j])
+                try:
+                    obs[i, j], reward, terminated, truncated, _ = envs[i][j].step(actions[i, j])
+                except InfeasibleActionError as error:
+                    self.refused[which[i]] = str(error)
+                    returns[i, j] = np.nan
+                    continue
                 returns[i, j] += reward
                 if not (terminated or truncated):
                     still_running.append((i, j))
             running = still_running
         return returns
 
-    def _envs_of(self, i: int) -> list[gymnasium.Env]:
+    def _envs_of(self, i: int) -> list[Any]:
         if i not in self.envs:
             self.envs[i] = [self.make_env() for _ in range(self.parallel)]
             for index, env in enumerate(self.envs[i]):
                 env.reset(seed=stream_seed(self.seeds[i], "evaluation", index))
         return self.envs[i]
 
-    def of_seed(self, i: int) -> list[gymnasium.Env]:
+    def of_seed(self, i: int) -> list[Any]:
         """The environments that the seed in position i has used so far."""
         return self.envs.get(i, [])
+
+    def get_state(self, i: int) -> list[dict]:
+        """The states of the environments that the seed in position i has used so far, between two evaluations."""
+        return [env.unwrapped.get_state() for env in self.of_seed(i)]
+
+    def set_state(self, i: int, states: Sequence[dict]) -> None:
+        """Put the environments of the seed in position i back into `states`."""
+        if states:
+            for env, state in zip(self._envs_of(i), states, strict=True):
+                env.unwrapped.set_state(state)
 
     def close(self) -> None:
         for env in (env for envs in self.envs.values() for env in envs):

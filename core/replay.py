@@ -41,6 +41,15 @@ class Replay:
             self.rows[i * self.capacity + self.added[i] % self.capacity] = rows[i]
             self.added[i] += 1
 
+    def stretch(self, i: int, start: int, stop: int) -> list[Tensor]:
+        """Views of the rows of transitions `start` to `stop` - 1 of the seed in position i, counted from its first
+        one; two views where the ring wraps. Only the last `capacity` transitions are there."""
+        ring = self.rows[i * self.capacity : (i + 1) * self.capacity]
+        first, last = start % self.capacity, stop % self.capacity
+        if first < last or start == stop:
+            return [ring[first:last]]
+        return [ring[first:], ring[:last]] if last else [ring[first:]]
+
     def sample(self, batch_size: int) -> Batch:
         """`batch_size` transitions of every seed, uniform with replacement."""
         sizes = [min(n, self.capacity) for n in self.added]

@@ -2,11 +2,15 @@
 
     results/<task>/<variant>/seed=<n>/
         config.yaml      the resolved configuration
-        info.json        versions, git commit, command line, start time
+        info.json        versions, git commit, machine, threads, command line, start time; so again for each resumption
         evaluations.csv  step,return_mean,return_1,...,return_k,seconds: one row an evaluation, appended
         training.csv     step and the algorithm's own measures (SAC: temperature, entropy), from the first update on
         best.pt last.pt  state dicts
         result.json      the final evaluation; written last, so its presence means that the run is finished
+        failed.json      in its place where the run diverged: at which step, what was not finite, last evaluation
+        checkpoint/      while the run is unfinished: see core/checkpoint.py
+    results/<task>/<variant>/seed=<n>.lock
+                         while a process trains the run: its process id and host; see core/lock.py
 
 `<variant>` is the algorithm's name followed by `,key=value` for each setting that differs from the paper's
 (`DPre+`, `SRad,learning_starts=10000,steps=50000`). Folders moved aside are called `seed=<n>.old-<i>`;
@@ -22,6 +26,7 @@ import re
 import shlex
 import subprocess
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib import metadata
@@ -32,6 +37,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import yaml
 
+_TABLES = ("evaluations.csv", "training.csv")
 _PACKAGES = ("torch", "numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omegaconf")
 # libyaml's loader is some ten times faster, which counts with two thousand runs; not every wheel has it.
 _YamlLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -66,6 +72,24 @@ def is_finished(folder: str | Path) -> bool:
     return Path(folder, "result.json").is_file()
 
 
+def has_failed(folder: str | Path) -> bool:
+    """Whether the run in `folder` ended because it diverged."""
+    return Path(folder, "failed.json").is_file()
+
+
+def has_ended(folder: str | Path) -> bool:
+    """Whether nothing is left to do for the run in `folder`: it is finished or has failed."""
+    return is_finished(folder) or has_failed(folder)
+
+
+def lockstep_group(folder: str | Path) -> tuple[int, ...]:
+    """The seeds that the run in `folder` was started with, from its info.json; empty where that does not say."""
+    try:
+        return tuple(_parse(Path(folder, "info.json"), json.loads)["lockstep"])
+    except (ValueError, KeyError, TypeError):
+        return ()
+
+
 def describe_environment(command: Sequence[str]) -> dict[str, Any]:
     """What `info.json` says: versions, git commit, command line, start time; no path of this machine."""
     versions: dict[str, str | None] = {"python": platform.python_version()}
@@ -81,8 +105,19 @@ def describe_environment(command: Sequence[str]) -> dict[str, Any]:
         "dirty": described and described.endswith("-dirty"),
         # Absolute paths, alone or after `key=`, are cut to their last part.
         "command": shlex.join(re.sub(r"(^|=)/.*/(?=.)", r"\1", word) for word in command),
+        "platform": platform.platform(),
+        "processor": _processor(),
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
+
+
+def _processor() -> str:
+    """The name of the CPU: float rounding depends on its instructions."""
+    with suppress(OSError), open("/proc/cpuinfo") as file:
+        for line in file:
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
 
 
 def _git_describe() -> str | None:
@@ -104,7 +139,7 @@ class RunWriter:
     """Writes the folder of one run, one seed.
 
     A folder already there is moved aside to `<folder>.old-<i>`; a finished run only with `replace_finished`,
-    FileExistsError otherwise.
+    FileExistsError otherwise. `resume` takes up an unfinished one instead.
     """
 
     def __init__(
@@ -115,7 +150,7 @@ class RunWriter:
         eval_episodes: int,
         replace_finished: bool = False,
     ):
-        self.folder = Path(folder)
+        self.folder, self.config = Path(folder), dict(config)
         self.eval_episodes = eval_episodes
         if self.folder.exists():
             if is_finished(self.folder) and not replace_finished:
@@ -124,8 +159,44 @@ class RunWriter:
         self.folder.mkdir(parents=True)
         columns = ["step", "return_mean", *(f"return_{i + 1}" for i in range(eval_episodes)), "seconds"]
         (self.folder / "evaluations.csv").write_text(",".join(columns) + "\n")
-        (self.folder / "info.json").write_text(json.dumps(info, indent=2) + "\n")
-        (self.folder / "config.yaml").write_text(yaml.safe_dump(dict(config), sort_keys=False))
+        self._save_info(info)
+        self._save_config()
+
+    @classmethod
+    def resume(
+        cls, folder: str | Path, config: Mapping[str, Any], info: Mapping[str, Any], eval_episodes: int
+    ) -> RunWriter:
+        """The writer of a run taken up again: `restore_tables` is for the trainer to call. `info` joins info.json."""
+        writer = cls.__new__(cls)
+        writer.folder, writer.config, writer.eval_episodes = Path(folder), dict(config), eval_episodes
+        try:
+            first = _parse(writer.folder / "info.json", json.loads)
+        except ValueError:  # it informs people; nothing that is to come depends on it
+            first = {}
+        writer._save_info(first | {"resumed": [*first.get("resumed", []), dict(info)]})
+        writer._save_config()
+        return writer
+
+    def tables(self) -> dict[str, str]:
+        """The text of evaluations.csv and training.csv as they are now."""
+        return {name: path.read_text() for name in _TABLES if (path := self.folder / name).exists()}
+
+    def restore_tables(self, tables: Mapping[str, str]) -> None:
+        """Put the text of `tables` back: rows written since then are gone."""
+        for name in _TABLES:
+            if name in tables:
+                self._replace(name, tables[name])
+            else:
+                (self.folder / name).unlink(missing_ok=True)
+
+    def _save_info(self, info: Mapping[str, Any]) -> None:
+        self._replace("info.json", json.dumps(info, indent=2) + "\n")
+
+    def _save_config(self) -> None:
+        self._replace("config.yaml", yaml.safe_dump(self.config, sort_keys=False))
+
+    def _replace(self, name: str, text: str) -> None:
+        replace_file(self.folder / name, lambda file: file.write(text.encode()))
 
     def append_evaluation(self, step: int, returns: Sequence[float] | np.ndarray, seconds: float) -> None:
         """Append the `returns` (eval_episodes,) at environment step `step`, `seconds` after the start."""
@@ -141,6 +212,15 @@ class RunWriter:
             self._append("training.csv", ["step", *values])
         self._append("training.csv", [str(int(step)), *(repr(float(value)) for value in values.values())])
 
+    def last_finite_evaluation(self) -> dict[str, float] | None:
+        """Step and mean return of the last evaluation whose mean is finite; None where there is none."""
+        evaluations = _read_evaluations(self.folder / "evaluations.csv")
+        finite = np.isfinite(evaluations.return_mean).nonzero()[0]
+        if not len(finite):
+            return None
+        last = finite[-1]
+        return {"step": int(evaluations.step[last]), "return_mean": float(evaluations.return_mean[last])}
+
     def _append(self, name: str, row: Sequence[str]) -> None:
         # One write of one line: a reader meanwhile sees it whole, or without its line end.
         with open(self.folder / name, "a") as file:
@@ -152,12 +232,15 @@ class RunWriter:
             raise ValueError(f"parameters are saved as 'best' or 'last', not {name!r}")
         import torch  # here alone: reading results needs no torch
 
-        _replace(self.folder / f"{name}.pt", lambda file: torch.save(dict(state_dict), file))
+        replace_file(self.folder / f"{name}.pt", lambda file: torch.save(dict(state_dict), file))
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Write `result.json`, which marks the run as finished. Arrays become lists of numbers."""
-        text = json.dumps(result, indent=2, default=methodcaller("tolist")) + "\n"
-        _replace(self.folder / "result.json", lambda file: file.write(text.encode()))
+        self._replace("result.json", json.dumps(result, indent=2, default=methodcaller("tolist")) + "\n")
+
+    def fail(self, record: Mapping[str, Any]) -> None:
+        """Write `failed.json`, which marks the run as one that diverged."""
+        self._replace("failed.json", json.dumps(record, indent=2) + "\n")
 
 
 def _move_aside(folder: Path) -> None:
@@ -167,14 +250,27 @@ def _move_aside(folder: Path) -> None:
     folder.rename(target)
 
 
-def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Write a file so that `path` holds the old content or all of the new, whenever the process dies."""
+def replace_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
+    """Write a file so that `path` holds the old content or all of the new, whenever the process or the machine dies.
+
+    OSError that names the file where it cannot be written.
+    """
     temporary = path.with_name(path.name + ".tmp")
-    with open(temporary, "wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # makes the new name last
+        finally:
+            os.close(folder)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink()  # on a full disk it would be in the way
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 class Evaluations(NamedTuple):
@@ -201,6 +297,7 @@ class Run:
     training: dict[str, np.ndarray]
     """Columns of training.csv, each (m,), the first called `step`; empty where the run has none."""
     result: dict[str, Any] | None
+    failure: dict[str, Any] | None = None  # of a run that diverged: step, quantity, ...
 
     @property
     def finished(self) -> bool:
@@ -223,6 +320,11 @@ def read_run(folder: str | Path) -> Run:
         result = _parse(folder / "result.json", json.loads)
         if not isinstance(result.get("return_mean"), (int, float)):
             raise ValueError(f"{folder / 'result.json'}: no return_mean")
+    failure = None
+    if has_failed(folder):
+        failure = _parse(folder / "failed.json", json.loads)
+        if not {"step", "quantity"} <= failure.keys():
+            raise ValueError(f"{folder / 'failed.json'}: no step or no quantity")
     return Run(
         folder=folder,
         task=folder.parent.parent.name,
@@ -234,13 +336,14 @@ def read_run(folder: str | Path) -> Run:
         evaluations=_read_evaluations(folder / "evaluations.csv"),
         training=_read_training(folder / "training.csv"),
         result=result,
+        failure=failure,
     )
 
 
 def read_results(
     root: str | Path, tasks: Collection[str] | None = None, algos: Collection[str] | None = None
 ) -> tuple[list[Run], list[str]]:
-    """All readable runs below `root` (of the given tasks and algorithms), and a line for each that is not."""
+    """All readable runs below `root` (of the given tasks and algorithms), and a line for each that is not or failed."""
     runs, problems = [], []
     for folder in find_runs(root):
         if tasks is not None and folder.parent.parent.name not in tasks:
@@ -248,17 +351,26 @@ def read_results(
         if algos is not None and parse_variant(folder.parent.name)[0] not in algos:
             continue
         try:
-            runs.append(read_run(folder))
+            run = read_run(folder)
         except ValueError as error:
             problems.append(str(error))
+            continue
+        runs.append(run)
+        if run.failure:
+            problems.append(f"{folder}: {describe_failure(run.failure)}")
     return runs, problems
+
+
+def describe_failure(failure: Mapping[str, Any]) -> str:
+    """One line that says what `failed.json` records."""
+    return f"failed at step {failure['step']}: {failure['quantity']}"
 
 
 def _parse(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
     try:
         content = parse(path.read_text())
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: {_reason(error)}") from error
+        raise ValueError(f"{path}: {one_line(error)}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path}: not a mapping")
     return content
@@ -292,12 +404,12 @@ def _read_rows(path: Path) -> tuple[list[str], np.ndarray]:
         if any(len(row) != len(columns) for row in rows):
             raise ValueError("a row does not have the header's number of columns")
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: {_reason(error)}") from error
+        raise ValueError(f"{path}: {one_line(error)}") from error
     return columns, np.array(rows, dtype=np.float64).reshape(-1, len(columns))
 
 
-def _reason(error: Exception) -> str:
-    """One line for the user."""
+def one_line(error: Exception) -> str:
+    """What `error` says to the user."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
     return " ".join(str(error).split())

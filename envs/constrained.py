@@ -1,6 +1,7 @@
 """The Gymnasium environment of a task: a robot that executes feasible actions only."""
 
 import difflib
+import json
 
 import gymnasium
 import numpy as np
@@ -54,12 +55,14 @@ class ActionConstrainedEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.robot.action_dim,), np.float32)
         self.largest_violation, self.executed_actions, self.elapsed_steps = -np.inf, 0, 0
         self._obs = None  # current observation as a tensor of its own: callers may write into theirs
+        self._start, self._actions = None, None  # of the episode: state of the random numbers before it; its actions
 
     def reset(self, *, seed=None, options=None):
         """Start an episode; return observation (n,) and info. `seed` as Gymnasium defines it."""
         super().reset(seed=seed)
+        self._start, self._actions, self.elapsed_steps = self.np_random.bit_generator.state, [], 0
         obs = self.robot.reset(self.np_random)
-        self._obs, self.elapsed_steps = torch.from_numpy(obs.copy()), 0
+        self._obs = torch.from_numpy(obs.copy())
         return obs, {}
 
     def step(self, action):
@@ -73,11 +76,47 @@ class ActionConstrainedEnv(gymnasium.Env):
         action = self._feasible(action)
         obs, reward, terminated, info = self.robot.step(action)
         self._obs = torch.from_numpy(obs.copy())
+        self._actions.append(np.array(action))
         self.executed_actions += 1
         self.elapsed_steps += 1
         if self.project:
             info["executed_action"] = np.array(action, np.float64)
-        return obs, reward, terminated, self.elapsed_steps >= self.robot.max_episode_steps, info
+        truncated = self.elapsed_steps >= self.robot.max_episode_steps
+        if terminated or truncated:  # only a reset can follow
+            self._start, self._actions = None, []
+        return obs, reward, terminated, truncated, info
+
+    def get_state(self):
+        """Everything that `set_state`, also in another process, needs to go on bit for bit: a dict of numbers, text,
+        lists and one tensor.
+
+        It holds the actions of the episode and the state of the random numbers at its start, not the simulator's
+        memory: simulators do not save all of that bit for bit (PyBullet), while the same actions after the same reset
+        repeat the episode exactly. Of an episode that is over only the random numbers are left.
+        """
+        random_numbers = self._start or self.np_random.bit_generator.state
+        return {
+            "random_numbers": json.dumps(random_numbers),
+            "in_episode": self._start is not None,
+            "actions": torch.from_numpy(np.array(self._actions)) if self._actions else None,
+            "executed_actions": self.executed_actions,
+            "largest_violation": self.largest_violation,
+        }
+
+    def set_state(self, state):
+        """Go back to what `get_state` described; after an episode that was over, the next call must be a reset.
+
+        An episode in progress is repeated from its start: at most 1,000 simulation steps.
+        """
+        self.np_random.bit_generator.state = json.loads(state["random_numbers"])
+        self._start, self._actions, self._obs = None, None, None
+        if state["in_episode"]:
+            self.reset()
+            for action in () if state["actions"] is None else state["actions"].numpy():
+                self._obs = torch.from_numpy(self.robot.step(action)[0].copy())
+                self._actions.append(action)
+            self.elapsed_steps = len(self._actions)
+        self.executed_actions, self.largest_violation = state["executed_actions"], state["largest_violation"]
 
     def render(self):
         """Picture (480, 480, 3), uint8, of the current state; None without `render_mode="rgb_array"`."""

@@ -57,6 +57,12 @@ class Scripted(gymnasium.Env):
     def close(self):
         self.closed = True
 
+    def get_state(self):
+        return {"episode": self.episode, "t": self.t, "executed": torch.tensor(np.array(self.executed))}
+
+    def set_state(self, state):
+        self.episode, self.t, self.executed = state["episode"], state["t"], list(state["executed"].numpy())
+
 
 class Counter(Agent):
     """Its one parameter a seed counts gradient steps; its policy's reward is the score of that number."""
@@ -69,6 +75,9 @@ class Counter(Agent):
 
     def networks(self):
         return {"net": self.net}
+
+    def optimizers(self):
+        return {}
 
     def explore(self, obs, only):
         return torch.full((len(self.seeds), DIM), 0.01)

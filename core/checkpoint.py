@@ -1,0 +1,226 @@
+"""Checkpoints: what a seed needs to train on, after any kind of end, exactly as it would have without one.
+
+    seed=<n>/checkpoint/
+        state-<serial>.pt           a moment of the seed; the newest and the one before it are kept
+        replay-<start>-<stop>.f32   transitions `start` to `stop` - 1 as rows of float32, written once
+
+A state file is a line with the SHA-256 of what follows, then a `torch.save` of tensors, numbers and text, read with
+`weights_only`: nothing in it is executed. It names the replay files that belong to it, with their checksums. Each
+file is complete and on disk before the next one names it, and only then is what nobody needs any more deleted; so
+whenever the process dies, a whole checkpoint is there.
+
+Seeds trained in lockstep share their `moment`. Taking up all of them at one moment again repeats every bit; any
+other choice would batch them differently, which changes the rounding.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from core.replay import Replay
+from core.results import one_line, replace_file
+
+
+class ReplayFile(NamedTuple):
+    """A stretch of one seed's transitions on disk."""
+
+    name: str
+    start: int
+    stop: int
+    digest: str
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """One seed at one moment, as found intact on disk.
+
+    `group` are the seeds that trained in lockstep, in order, `step` this one's environment steps, `settings` its
+    configuration; the moments of one process have ascending serial numbers.
+    """
+
+    path: Path
+    serial: int
+    moment: str
+    group: tuple[int, ...]
+    step: int
+    settings: dict[str, Any]
+    replay_files: tuple[ReplayFile, ...]
+
+    def state(self) -> dict[str, Any]:
+        """What `CheckpointFolder.write` was given."""
+        return _load(self.path)["state"]
+
+    def fill(self, replay: Replay, i: int) -> None:
+        """Put the transitions back into position i of `replay`."""
+        for name, start, stop, _ in self.replay_files:
+            kept = max(start, replay.added[i] - replay.capacity)  # the ring has overwritten those before
+            with open(self.path.parent / name, "rb") as file:
+                file.seek((kept - start) * sum(replay.widths) * 4)
+                for rows in replay.stretch(i, kept, stop):
+                    file.readinto(rows.numpy().data.cast("B"))
+
+
+class CheckpointFolder:
+    """The checkpoints of one run, that is, one seed."""
+
+    def __init__(self, run_folder: str | Path):
+        self.folder = Path(run_folder) / "checkpoint"
+        self.serial = 0
+        # of the newest state file and of the one before it
+        self.files: list[ReplayFile] = []
+        self.previous_files: list[ReplayFile] = []
+
+    def write(
+        self,
+        moment: str,
+        group: Sequence[int],
+        step: int,
+        settings: Mapping[str, Any],
+        state: Mapping[str, Any],
+        replay: Replay,
+        i: int,
+    ) -> None:
+        """Keep the seed in position i of `replay` at this moment: OSError leaves the checkpoints before it valid."""
+        self.folder.mkdir(exist_ok=True)
+        try:
+            files = self._write_replay(replay, i)
+            body = io.BytesIO()
+            content = {"serial": self.serial + 1, "moment": moment, "group": list(group), "step": step}
+            content |= {"settings": dict(settings), "replay_files": [list(file) for file in files]}
+            torch.save(content | {"state": dict(state)}, body)
+            digest = hashlib.sha256(body.getbuffer()).hexdigest().encode() + b"\n"
+            path = self._state_path(self.serial + 1)
+            replace_file(path, lambda file: file.writelines([digest, body.getbuffer()]))
+        except OSError:
+            self._delete_unused()
+            raise
+        self.serial, self.files, self.previous_files = self.serial + 1, files, self.files
+        self._delete_unused()
+
+    def _write_replay(self, replay: Replay, i: int) -> list[ReplayFile]:
+        """Write the transitions added since the last checkpoint; the files with all that are in the buffer now."""
+        stop = replay.added[i]
+        oldest = max(0, stop - replay.capacity)
+        files = [file for file in self.files if file.stop > oldest]
+        start = max(oldest, files[-1].stop if files else 0)
+        if start < stop:
+            name, digest = f"replay-{start}-{stop}.f32", hashlib.sha256()
+            stretch = [rows.numpy().data.cast("B") for rows in replay.stretch(i, start, stop)]
+            for rows in stretch:
+                digest.update(rows)
+            replace_file(self.folder / name, lambda file: file.writelines(stretch))
+            files.append(ReplayFile(name, start, stop, digest.hexdigest()))
+        return files
+
+    def _state_path(self, serial: int) -> Path:
+        return self.folder / f"state-{serial}.pt"
+
+    def _delete_unused(self) -> None:
+        """Delete all but the newest two state files and the replay files that they name."""
+        used = {self._state_path(serial).name for serial in (self.serial, self.serial - 1)}
+        used |= {file.name for file in (*self.files, *self.previous_files)}
+        for path in self.folder.iterdir():
+            if path.name not in used:
+                path.unlink()
+
+    def read(self) -> tuple[list[Checkpoint], list[str]]:
+        """The intact checkpoints, newest first, and a line for each that is not."""
+        intact, problems = [], []
+        digests: dict[str, str] = {}  # of replay files: both checkpoints name most of them
+        for path in sorted(self.folder.glob("state-*.pt"), key=_serial_of, reverse=True):
+            try:
+                content = _load(path)
+                files = tuple(ReplayFile(*file) for file in content["replay_files"])
+                for file in files:
+                    if file.name not in digests:
+                        digests[file.name] = _digest(self.folder / file.name)
+                    if digests[file.name] != file.digest:
+                        raise ValueError(f"{file.name} has a wrong checksum")
+                keys = ("serial", "moment", "step", "settings")
+                intact.append(
+                    Checkpoint(
+                        path=path, group=tuple(content["group"]), replay_files=files, **{k: content[k] for k in keys}
+                    )
+                )
+            except (OSError, ValueError, KeyError, RuntimeError, pickle.UnpicklingError) as error:
+                problems.append(f"{path}: damaged checkpoint: {one_line(error)}")
+        return intact, problems
+
+    def resume(self, checkpoint: Checkpoint, intact: Sequence[Checkpoint]) -> None:
+        """Go on from `checkpoint`, one of the `intact` that were read; what is newer is deleted."""
+        self.serial, self.files = checkpoint.serial, list(checkpoint.replay_files)
+        self.previous_files = [file for other in intact if other.serial < self.serial for file in other.replay_files]
+        for path in self.folder.glob("state-*.pt"):
+            if _serial_of(path) > self.serial:
+                path.unlink()
+
+    def remove(self) -> None:
+        """Delete all of it."""
+        if self.folder.is_dir():
+            for path in self.folder.iterdir():
+                path.unlink()
+            self.folder.rmdir()
+
+
+def choose(
+    intact: Mapping[int, Sequence[Checkpoint]], started: Mapping[int, tuple[int, ...]]
+) -> tuple[list[dict[int, Checkpoint]], list[int]]:
+    """Which seeds to take up together, each from which checkpoint, and which seeds to start from the beginning.
+
+    `intact` maps each seed to its checkpoints, newest first; `started` to the group it was started in. The moment that
+    most seeds have comes first, the newest of those: after a death between the writing of two seeds' checkpoints that
+    is the one before. The beginning is a moment like others, as long as no more than one checkpoint followed it.
+    """
+    moments: dict[Any, dict[int, Checkpoint | None]] = {}
+    for seed, checkpoints in intact.items():
+        for checkpoint in checkpoints:
+            moments.setdefault(checkpoint.moment, {})[seed] = checkpoint
+        if not checkpoints or checkpoints[-1].serial == 1:
+            moments.setdefault(("beginning", started[seed]), {})[seed] = None
+
+    groups: list[dict[int, Checkpoint]] = []
+    fresh: list[int] = []
+    remaining = set(intact)
+    while remaining:
+
+        def rank(seeds: dict[int, Checkpoint | None]) -> tuple[int, int]:
+            return len(seeds.keys() & remaining), max(c.serial if c else 0 for c in seeds.values())  # noqa: B023
+
+        best = max(moments.values(), key=rank)
+        taken = {seed: best[seed] for seed in sorted(best.keys() & remaining)}
+        if all(taken.values()):
+            groups.append(taken)
+        else:
+            fresh += taken
+        remaining -= taken.keys()
+    return groups, sorted(fresh)
+
+
+def _serial_of(path: Path) -> int:
+    number = path.stem.removeprefix("state-")
+    return int(number) if number.isdecimal() else -1
+
+
+def _load(path: Path) -> dict[str, Any]:
+    with open(path, "rb") as file:
+        digest = file.readline(100).rstrip(b"\n").decode("ascii", "replace")
+        body = io.BytesIO(file.read())
+    if hashlib.sha256(body.getbuffer()).hexdigest() != digest:
+        raise ValueError("wrong checksum")
+    return torch.load(body, weights_only=True)
+
+
+def _digest(path: Path) -> str:
+    digest, block = hashlib.sha256(), bytearray(1 << 20)
+    with open(path, "rb") as file:
+        while size := file.readinto(block):
+            digest.update(memoryview(block)[:size])
+    return digest.hexdigest()

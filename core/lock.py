@@ -1,0 +1,86 @@
+"""One process a run: a lock that dies with its owner and tells others who that is."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+class LockedError(RuntimeError):
+    """Another process trains this run; the message names it."""
+
+
+@contextmanager
+def run_lock(run_folder: Path) -> Iterator[None]:
+    """Holds `<run folder>.lock` while the context is open; LockedError where another process has it.
+
+    The operating system's lock on the open file says whether an owner on this host is alive: it ends with the process,
+    however that ends. The file's text names the owner. Not every network file system passes locks on to other hosts,
+    so a file that another host left there counts as held.
+    """
+
+    path = run_folder.with_name(run_folder.name + ".lock")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = _acquire(path, run_folder)
+    while file is None:
+        file = _acquire(path, run_folder)
+    try:
+        os.truncate(file, 0)
+        os.pwrite(file, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode() + b"\n", 0)
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(file)
+
+
+def _acquire(path: Path, run_folder: Path) -> int | None:
+    """The descriptor of the locked file; None if its owner deleted it between our opening and locking it."""
+    file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        owner, here = _read_owner(file), socket.gethostname()
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held = False
+        except BlockingIOError:
+            held = True
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+                raise
+            held = owner is not None and owner["host"] == here and _is_alive(owner["pid"])
+        name = f"process {owner['pid']} on {owner['host']}" if owner else "another process"
+        if held:
+            raise LockedError(f"{run_folder} is being trained by {name}")
+        if owner and owner["host"] != here:
+            raise LockedError(f"{run_folder} is being trained by {name}; if that has ended, delete {path}")
+        if path.exists() and os.path.samestat(os.stat(path), os.fstat(file)):
+            return file
+    except BaseException:
+        os.close(file)
+        raise
+    os.close(file)
+    return None
+
+
+def _read_owner(file: int) -> dict[str, Any] | None:
+    try:
+        owner = json.loads(os.pread(file, 1000, 0))
+        return {"pid": int(owner["pid"]), "host": str(owner["host"])}
+    except (ValueError, KeyError, TypeError):
+        return None  # just created, or not written by us
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return pid != os.getpid()  # a namesake of ours in a container before this one

@@ -147,7 +147,7 @@ def test_a_run_from_the_shell_and_what_it_leaves(tmp_path):
         assert finished.evaluations.step.tolist() == [40]
         assert {p.name for p in finished.folder.iterdir()} >= {"best.pt", "last.pt", "info.json"}
         seconds = finished.result["seconds"]
-        assert set(seconds) == {"environment", "map", "update", "evaluation", "total"}
+        assert set(seconds) == {"environment", "map", "update", "evaluation", "checkpoint", "total"}
         assert 0 < sum(seconds.values()) - seconds["total"] <= seconds["total"]
 
     again = python("run.py", *words)

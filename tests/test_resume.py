@@ -1,6 +1,5 @@
 """A run that is interrupted, killed or damaged and taken up again ends with every bit of the run that never was."""
 
-import json
 import multiprocessing
 import random
 import time
@@ -112,7 +111,7 @@ def kill_through(root, words, kills, rng):
         if n < kills:
             process.join(rng.uniform(0.0, longest))
             process.kill()
-            longest = 5.0
+            longest = 3.0
         process.join()
     return time.monotonic() - start
 
@@ -122,5 +121,7 @@ def test_killed_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path, chec
     words = f"algo=DAlpha env=W+M seed=3,5 {SETTINGS}"
     train(tmp_path / "whole", words)
     # With a checkpoint after every step, most kills meet the writing of one, often between the two seeds' files.
-    kill_through(tmp_path / "broken", f"{words} checkpoint_every={checkpoint_every}", 6, random.Random(checkpoint_every))
+    kill_through(
+        tmp_path / "broken", f"{words} checkpoint_every={checkpoint_every}", 6, random.Random(checkpoint_every)
+    )
     assert_identical(outcome(tmp_path / "whole"), outcome(tmp_path / "broken"))

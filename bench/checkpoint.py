@@ -1,0 +1,89 @@
+"""What a checkpoint costs with a full replay buffer: `python bench/checkpoint.py [seeds=1,10] [env=HC+O] [folder=DIR]`.
+
+For each number of seeds in lockstep, with a million transitions a seed (synthetic: only their size matters): time and
+bytes of a checkpoint after `checkpoint_every` steps, of one that has to write the whole buffer, and of resuming; the
+memory that writing needs beside the training's; and the share of the training's time, from the time of a gradient
+step measured here.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import torch
+
+import run
+from core.checkpoint import CheckpointFolder
+from core.config import saved_settings
+from core.results import RunWriter
+
+TRANSITIONS = 1_000_000
+
+
+def megabytes(folder: Path) -> float:
+    return sum(path.stat().st_size for path in folder.glob("*/checkpoint/*")) / 1e6
+
+
+def peak() -> float:
+    """The most memory that this process has had so far, in megabytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
+def timed(action) -> float:
+    start = time.perf_counter()
+    action()
+    return time.perf_counter() - start
+
+
+def measure(config, count: int, folder: Path) -> None:
+    seeds = list(range(count))
+    folders = [folder / f"seed={seed}" for seed in seeds]
+    writers = [RunWriter(path, saved_settings(config, seed), {}, 1) for path, seed in zip(folders, seeds, strict=True)]
+    trainer = run.make_trainer(config, seeds, writers, progress=False)
+    trainer._begin()
+    trainer.replay.rows.uniform_()
+    trainer.replay.added = [TRANSITIONS] * count
+    update = min(timed(lambda: trainer.agent.update(trainer.replay.sample(config.batch_size))) for _ in range(10))
+    for i in seeds:
+        trainer.best[i] = (0.0, 0, trainer.agent.state(i))
+
+    before = peak()
+    whole = timed(trainer._checkpoint), megabytes(folder)
+    trainer.replay.added = [TRANSITIONS + config.checkpoint_every] * count
+    seconds = timed(trainer._checkpoint)
+    written = megabytes(folder) - whole[1]
+    training = config.checkpoint_every * update
+    print(f"seeds={count}: a gradient step takes {1e3 * update:.1f} ms")
+    print(f"  whole buffer: {whole[0]:.2f} s, {whole[1]:.0f} MB")
+    print(f"  after {config.checkpoint_every} steps: {seconds:.2f} s, {written:.1f} MB,", end=" ")
+    print(f"{100 * seconds / training:.2f} % of the time of as many gradient steps")
+    print(f"  memory: {peak() - before:.0f} MB more than the {before:.0f} MB of training")
+
+    newest = []
+
+    def resume() -> None:
+        newest.extend(CheckpointFolder(path).read()[0][0] for path in folders)
+        trainer.restore(newest)
+
+    print(f"  resuming: {timed(resume):.1f} s", flush=True)
+
+
+def main(arguments: list[str]) -> None:
+    options = {"seeds": "1,10", "env": "HC+O", "folder": None} | dict(word.split("=", 1) for word in arguments)
+    ((config, _),) = run.plan(["algo=DPre", f"env={options['env']}"])
+    torch.set_num_threads(1)
+    for count in map(int, options["seeds"].split(",")):
+        with tempfile.TemporaryDirectory(dir=options["folder"]) as folder:
+            measure(config, count, Path(folder))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,226 @@
+"""A seed that diverges stops with a record, and its neighbours learn, bit for bit, what they would have anyway."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from test_resume import Breaks, assert_identical, outcome, train, train_through
+
+import envs
+import run
+from algos import ALGORITHMS
+from core.random import stream_seed
+from core.results import read_results, read_run
+from envs import ActionConstrainedEnv
+
+WORDS = (
+    "seed=3,5,8 steps=120 learning_starts=40 batch_size=8 hidden=[8,8] eval_every=60 eval_episodes=1 final_episodes=1"
+    " train_freq=1 gradient_steps=1"
+)
+BAD = 1  # position of the seed that diverges
+MOMENT = 46  # its gradient step, one with a step of the actor
+
+
+def spoil(network, value, seed=BAD, where=...):
+    """What sets weights of the first layer of `network`, in the seed at position `seed`."""
+
+    def how(agent):
+        for name, parameter in agent.networks()[network].named_parameters():
+            if name.endswith("layers.0.weight"):
+                parameter.data[seed][where] = value
+
+    return how
+
+
+def poison(monkeypatch, algo, how, at=MOMENT):
+    """Let `how(agent)` spoil the agent before its gradient step number `at`."""
+    agent_class = ALGORITHMS[algo].agent
+    update, counts = agent_class.update, {}
+
+    def spoiled(self, batch):
+        counts[self] = counts.get(self, 0) + 1
+        if counts[self] == at:
+            how(self)
+        update(self, batch)
+
+    monkeypatch.setattr(agent_class, "update", spoiled)
+
+
+def failures(root):
+    return {path.parent.name: json.loads(path.read_text()) for path in root.glob("*/*/seed=?/failed.json")}
+
+
+@pytest.mark.parametrize(
+    "cell, network, value, quantity",
+    [
+        ("algo=DPre+ env=R+O10", "critic", math.nan, "critic loss is not finite"),
+        ("algo=DPre+ env=R+O10", "critic", 1e30, "critic loss is not finite"),
+        ("algo=DOpt env=W+O+S", "actor", math.nan, "actor loss is not finite"),
+        ("algo=NFW env=H+O+S", "critic", math.inf, "critic loss is not finite"),
+        ("algo=DAlpha env=W+M", "critic_target", math.nan, "critic loss is not finite"),
+        ("algo=SRad env=R+M", "critic", math.nan, "critic loss is not finite"),
+        ("algo=SAlpha env=W+M", "actor", math.nan, "temperature loss is not finite"),
+    ],
+)
+def test_the_neighbours_of_a_seed_that_diverges_notice_nothing(
+    tmp_path, monkeypatch, capsys, cell, network, value, quantity
+):
+    words = f"{cell} {WORDS}"
+    train(tmp_path / "sound", words)
+    poison(monkeypatch, cell.split()[0].partition("=")[2], spoil(network, value))
+    assert run.main([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
+    (failed,) = failures(tmp_path / "spoiled").items()
+    assert failed[0] == "seed=5" and failed[1]["quantity"] == quantity
+    assert failed[1]["step"] == 40 + MOMENT and failed[1]["gradient_steps"] == MOMENT
+    sound = outcome(tmp_path / "sound")
+    assert failed[1]["last_evaluation"] == {
+        "step": 60,
+        "return_mean": float(sound["seed=5"]["evaluations"][1].split(",")[1]),
+    }
+    spoiled = outcome_of_finished(tmp_path / "spoiled")
+    assert_identical({seed: sound[seed] for seed in ("seed=3", "seed=8")}, spoiled)
+
+
+def outcome_of_finished(root):
+    for folder in root.glob("*/*/seed=5"):
+        folder.rename(folder.with_name("aside"))
+    return outcome(root)
+
+
+def test_a_failed_run_is_reported_and_not_run_again_unless_asked(tmp_path, monkeypatch, capsys):
+    words = [*f"algo=DPre env=R+N {WORDS}".split(), f"results={tmp_path}"]
+    with monkeypatch.context() as patch:
+        poison(patch, "DPre", spoil("critic", math.nan))
+        assert run.main(words) == 3
+    (folder,) = tmp_path.glob("*/*/seed=5")
+    said = f"{folder}: failed at step 86: critic loss is not finite"
+    assert said in capsys.readouterr().err
+    runs, problems = read_results(tmp_path)
+    assert problems == [said] and len(runs) == 3
+    failed = read_run(folder)
+    assert failed.failure["step"] == 86 and not failed.finished and failed.evaluations.step.tolist() == [60]
+    assert not (folder / "checkpoint").exists() and (folder / "last.pt").is_file()
+    assert torch.load(folder / "last.pt", weights_only=True)["critic.net.layers.0.weight"].isnan().any()
+    assert torch.load(folder / "best.pt", weights_only=True)["critic.net.layers.0.weight"].isfinite().all()
+
+    assert run.main(words) == 3
+    assert capsys.readouterr().out.count("overwrite=true") == 3
+    assert run.main([*words, "overwrite=true"]) == 0
+    assert (folder / "result.json").is_file() and (folder.with_name("seed=5.old-1") / "failed.json").is_file()
+    (folder / "failed.json").write_text("{}")
+    assert read_results(tmp_path)[1] == [f"{folder / 'failed.json'}: no step or no quantity"]
+
+
+def test_after_a_failure_the_others_resume_exactly(tmp_path, monkeypatch):
+    words = f"algo=DPre env=R+N {WORDS}"
+    train(tmp_path / "sound", words)
+    with monkeypatch.context() as patch:
+        poison(patch, "DPre", spoil("critic", math.nan))
+        check = Breaks(300)
+        with pytest.raises(type(check.error)):
+            train(tmp_path / "spoiled", words, check)
+    assert list(failures(tmp_path / "spoiled")) == ["seed=5"]
+    assert train_through(tmp_path / "spoiled", words, Breaks(10, 60)) == 2
+    sound = outcome(tmp_path / "sound")
+    assert_identical({seed: sound[seed] for seed in ("seed=3", "seed=8")}, outcome_of_finished(tmp_path / "spoiled"))
+
+
+def test_all_seeds_may_fail(tmp_path, monkeypatch):
+    def how(agent):
+        for i in range(3):
+            spoil("critic", math.nan, i)(agent)
+
+    poison(monkeypatch, "DPre", how)
+    assert run.main([*f"algo=DPre env=R+N {WORDS}".split(), f"results={tmp_path}"]) == 3
+    assert len(failures(tmp_path)) == 3 and not list(tmp_path.rglob("checkpoint"))
+
+
+def test_a_parameter_that_no_loss_shows_is_found_before_it_is_evaluated(tmp_path, monkeypatch):
+    def how(agent):  # minus infinity into a ReLU
+        agent.actor.layers[0].bias.data[BAD, 0, 0] = -math.inf
+
+    poison(monkeypatch, "DPre", how, at=79)
+    assert run.main([*f"algo=DPre env=R+N {WORDS}".split(), f"results={tmp_path}"]) == 3
+    ((name, failure),) = failures(tmp_path).items()
+    assert name == "seed=5" and failure["quantity"] == "parameter actor.layers.0.bias is not finite"
+    assert failure["step"] == 120 and failure["last_evaluation"]["step"] == 60
+
+
+@pytest.mark.parametrize("algo", ["DRad", "DPre"])
+def test_an_action_that_is_not_finite(tmp_path, monkeypatch, algo):
+    explore = ALGORITHMS[algo].agent.explore
+
+    def spoiled(self, obs, only):
+        suggested = explore(self, obs, only)
+        if self.updates == MOMENT:
+            suggested[BAD] = math.nan
+        return suggested
+
+    monkeypatch.setattr(ALGORITHMS[algo].agent, "explore", spoiled)
+    assert run.main([*f"algo={algo} env=R+L2 {WORDS}".split(), f"results={tmp_path}"]) == 3
+    ((name, failure),) = failures(tmp_path).items()
+    assert name == "seed=5" and failure["quantity"] == "suggested action [nan, nan] is not finite"
+
+
+def test_a_map_that_gives_an_infeasible_action_ends_the_seed_and_says_by_how_much(tmp_path, monkeypatch):
+    feasible = ALGORITHMS["DPro"].agent.feasible
+
+    def spoiled(self, obs, suggested, center):
+        executed = feasible(self, obs, suggested, center)
+        if self.updates == MOMENT and suggested.dim() == 2:
+            executed[BAD] = 0.5
+        return executed
+
+    monkeypatch.setattr(ALGORITHMS["DPro"].agent, "feasible", spoiled)
+    assert run.main([*f"algo=DPro env=R+L2 {WORDS}".split(), f"results={tmp_path}"]) == 3
+    ((name, failure),) = failures(tmp_path).items()
+    assert name == "seed=5" and "violates the constraint by 0.48" in failure["quantity"]
+
+
+def test_an_evaluation_with_a_refused_action(tmp_path, monkeypatch):
+    agent_class = ALGORITHMS["DRad"].agent
+    policy = agent_class.policy
+
+    def spoiled(self, which):
+        act = policy(self, which)
+
+        def acts(obs):
+            action = act(obs)
+            if self.updates > MOMENT and BAD in which:
+                action[list(which).index(BAD)] = math.nan
+            return action
+
+        return acts
+
+    words = f"algo=DRad env=R+L2 {WORDS}"
+    train(tmp_path / "sound", words)
+    monkeypatch.setattr(agent_class, "policy", spoiled)
+    assert run.main([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
+    ((name, failure),) = failures(tmp_path / "spoiled").items()
+    assert name == "seed=5" and failure["quantity"].startswith(
+        "evaluation: R+L2, step 1 of the episode: action [nan nan]"
+    )
+    sound = outcome(tmp_path / "sound")
+    assert_identical({seed: sound[seed] for seed in ("seed=3", "seed=8")}, outcome_of_finished(tmp_path / "spoiled"))
+
+
+@pytest.mark.parametrize("what", ["observation", "reward"])
+def test_an_environment_that_breaks_down(tmp_path, monkeypatch, what):
+    step = ActionConstrainedEnv.step
+
+    def spoiled(self, action):
+        obs, reward, *rest = step(self, action)
+        # Seed 5 alone stands here at its 30th step.
+        if self.executed_actions == 30 and np.isclose(obs[0], target[0]):
+            obs, reward = (obs * math.nan, reward) if what == "observation" else (obs, math.inf)
+        return obs, reward, *rest
+
+    words = f"algo=DPre env=R+N {WORDS}"
+    target = envs.make("R+N").reset(seed=stream_seed(5, "environment"))[0]
+    monkeypatch.setattr(ActionConstrainedEnv, "step", spoiled)
+    assert run.main([*words.split(), f"results={tmp_path}"]) == 3
+    ((name, failure),) = failures(tmp_path).items()
+    assert name == "seed=5" and failure["quantity"] == "observation or reward is not finite" and failure["step"] == 29
+    assert failure["last_evaluation"] is None

@@ -6,7 +6,7 @@
 Suggestions come from random networks with exploding weights, from a list of extreme numbers (up to 3e38, denormal,
 -0.0, infinite, NaN) and from the boundary of the set. In the simulators each is mapped and executed in float32, as in
 training, and the environment checks it in float64. The checks without simulator take observations no robot reaches:
-velocities of zero, denormal and up to 1e30, angles up to 7. (A map sees them in float32. Of an angle of 1e5 that leaves
+velocities of zero, denormal and up to 1e15, angles up to 7. (A map sees them in float32. Of an angle of 1e5 that leaves
 too little for its sine, which the check in float64 would notice.) Suggestions that are not finite must be refused,
 clearly; everything else must be executed with a violation of at most 1e-6.
 
@@ -33,7 +33,6 @@ from core.networks import MLP
 from envs import TASKS, TOLERANCE, InfeasibleActionError
 
 MAPS = ("project", "alpha_map", "radial_map")
-PARALLEL = 50  # environments of one task and map, each with a network of its own
 NETWORK_STEPS = 25  # steps between new networks
 EXTREMES = [0.0, -0.0, 1e-45, -1e-45, 1e-38, 1e-20, -1e-8, 0.5, 1.0, -1.0, 1.0 + 1e-6, 3.0, -20.0, 1e5, 1e10, -1e30]
 EXTREMES += [1e30, 3e38, -3e38]
@@ -44,8 +43,8 @@ NOT_FINITE = [float("inf"), float("-inf"), float("nan")]
 class Soak:
     """Runs the checks of one task and counts; `problems` are lines that tell how to reproduce a failure."""
 
-    def __init__(self, task: str, seed: int):
-        self.task, self.constraint = task, envs.constraint(task)
+    def __init__(self, task: str, seed: int, parallel: int):
+        self.task, self.parallel, self.constraint = task, parallel, envs.constraint(task)
         self.robot, self.dim = TASKS[task].robot, TASKS[task].constraint.dim
         self.generator = torch.Generator().manual_seed(seed)
         self.executed = self.checked = self.refused = 0
@@ -63,10 +62,10 @@ class Soak:
 
     def networks(self) -> MLP:
         """Actors side by side whose weights are between a hundredth and a million times the usual size."""
-        actor = MLP([self.robot.obs_dim, 32, 32, self.dim], [self.generator] * PARALLEL)
+        actor = MLP([self.robot.obs_dim, 32, 32, self.dim], [self.generator] * self.parallel)
         with torch.no_grad():
             for parameter in actor.parameters():
-                parameter *= 10.0 ** (8 * torch.rand(PARALLEL, 1, 1, generator=self.generator) - 2)
+                parameter *= 10.0 ** (8 * torch.rand(self.parallel, 1, 1, generator=self.generator) - 2)
         return actor
 
     def spoil(self, obs: Tensor, suggested: Tensor) -> Tensor:
@@ -84,15 +83,15 @@ class Soak:
     @torch.no_grad()
     def simulate(self, name: str, steps: int, progress: tqdm) -> None:
         """`steps` steps of the simulators in all, with the map `name`."""
-        robots = [envs.make(self.task) for _ in range(PARALLEL)]
-        seeds = torch.randint(2**31, (PARALLEL,), generator=self.generator).tolist()
+        robots = [envs.make(self.task) for _ in range(self.parallel)]
+        seeds = torch.randint(2**31, (self.parallel,), generator=self.generator).tolist()
         obs = np.stack([env.reset(seed=seed)[0] for env, seed in zip(robots, seeds, strict=True)])
-        for step in range(-(-steps // PARALLEL)):
+        for step in range(-(-steps // self.parallel)):
             if step % NETWORK_STEPS == 0:
                 actor = self.networks()
             seen = torch.from_numpy(obs).float()
             suggested = self.spoil(seen, actor(seen.unsqueeze(1)).squeeze(1))
-            suggested[self.chance(0.01, PARALLEL)] = self.pick(NOT_FINITE, 1)
+            suggested[self.chance(0.01, self.parallel)] = self.pick(NOT_FINITE, 1)
             sound = suggested.isfinite().all(-1)
             executed = getattr(self.constraint, name)(seen, torch.where(sound.unsqueeze(-1), suggested, 0.0)).numpy()
             for i, env in enumerate(robots):
@@ -105,7 +104,7 @@ class Soak:
                     terminated = True
                 if terminated or truncated or not np.isfinite(obs[i]).all():
                     obs[i] = env.reset()[0]
-            progress.update(PARALLEL)
+            progress.update(self.parallel)
         for env in robots:
             self.executed += env.executed_actions
             self.largest[name] = max(self.largest[name], env.largest_violation)
@@ -142,7 +141,7 @@ class Soak:
         width = self.robot.obs_dim
         size = 10.0 ** (3 * torch.rand(n, 1, generator=self.generator) - 2)
         ordinary = (size * self.normal(n, width)).double() * (1 + 1e-9)  # no float32 has these digits
-        extreme = self.pick(EXTREMES, n, width).double().clamp(-1e30, 1e30)
+        extreme = self.pick(EXTREMES, n, width).double().clamp(-1e15, 1e15)
         share = self.pick([0.0, 0.2, 1.0], n, 1)
         obs = torch.where(torch.rand(n, width, generator=self.generator) < share, extreme, ordinary)
         angles = ANGLES[self.robot.__name__]
@@ -153,14 +152,15 @@ class Soak:
         self.problems.append(f"{self.task} {name}: {what}; obs={obs.tolist()} suggested={suggested.tolist()}")
 
 
-def soak(tasks: list[str], steps: int, checks: int, seed: int, progress: bool = True) -> list[Soak]:
-    """`steps` simulated and `checks` unsimulated actions, shared out among the tasks and maps."""
+def soak(tasks: list[str], steps: int, checks: int, seed: int, parallel: int = 50, progress: bool = True) -> list[Soak]:
+    """`steps` simulated and `checks` unsimulated actions, shared out among the tasks and maps; of each task, `parallel`
+    environments are stepped together, each with a network of its own."""
     share = len(tasks) * len(MAPS)
     soaks = []
     torch.set_flush_denormal(True)  # as run.py does
     with tqdm(total=steps + checks, unit="action", smoothing=0.01, disable=not progress) as bar:
         for task in tasks:
-            soaks.append(Soak(task, seed))
+            soaks.append(Soak(task, seed, parallel))
             for name in MAPS:
                 bar.set_description(f"{task} {name}")
                 soaks[-1].simulate(name, -(-steps // share), bar)
@@ -180,8 +180,9 @@ def main(arguments: list[str]) -> int:
     counts = {what: sum(getattr(result, what) for result in soaks) for what in ("executed", "checked", "refused")}
     print(", ".join(f"{count:,} {what}" for what, count in counts.items()))
     problems = [problem for result in soaks for problem in result.problems]
-    for problem in problems[:20]:
-        print(problem)
+    for result in soaks:
+        for problem in result.problems[:10]:
+            print(problem)
     print(f"{len(problems)} problems")
     return 1 if problems else 0
 

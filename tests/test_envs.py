@@ -486,3 +486,71 @@ def test_no_opengl_backend_is_a_clear_error(monkeypatch):
         env.render()
     env.step(np.zeros(3))  # training goes on
     env.close()
+
+
+# ---------------------------------------------------------------- state
+
+
+def rollout(env, rng, steps):
+    """Step with random actions, resetting where an episode ends; all that the environment answers."""
+    answers = []
+    for _ in range(steps):
+        obs, reward, terminated, truncated, _ = env.step(SMALL * draw(rng, env).astype(np.float32))
+        if terminated or truncated:
+            obs, _ = env.reset()
+        answers.append([*obs, reward, terminated, truncated])
+    return np.array(answers)
+
+
+@pytest.mark.parametrize("task", ["R+L2", "HC+O", "H+O+S", "W+M"])
+@pytest.mark.parametrize("steps", [0, 1, 140])
+def test_an_environment_goes_on_bit_for_bit_from_a_saved_state(task, steps, tmp_path):
+    rng = np.random.default_rng(steps)
+    env, other = envs.make(task), envs.make(task)
+    env.reset(seed=1)
+    rollout(env, rng, steps)
+    torch.save(env.get_state(), tmp_path / "state.pt")
+    actions = rng.bit_generator.state
+    wanted = rollout(env, rng, 200)
+    other.reset(seed=2)  # another past must not show
+    rollout(other, np.random.default_rng(9), 77)
+    other.set_state(torch.load(tmp_path / "state.pt", weights_only=True))
+    rng.bit_generator.state = actions
+    np.testing.assert_array_equal(rollout(other, rng, 200), wanted)
+    assert (other.executed_actions, other.largest_violation) == (env.executed_actions, env.largest_violation)
+    assert other.elapsed_steps == env.elapsed_steps
+    env.close(), other.close()
+
+
+@pytest.mark.parametrize("task", ["R+N", "HC+MA"])
+def test_an_episode_does_not_depend_on_those_before_it(task):
+    """Saved states rest on this; the actions drive the arm against its limits and the robot onto its back."""
+    rng = np.random.default_rng(0)
+    env, fresh = envs.make(task, project=True), envs.make(task, project=True)
+    env.reset(seed=1)
+    for _ in range(3):
+        for _ in range(120):
+            env.step(np.sign(rng.standard_normal(env.action_space.shape)))
+        start = env.np_random.bit_generator.state
+        actions = np.sign(rng.standard_normal((100, *env.action_space.shape)))
+        answers = []
+        for each in (env, fresh):
+            each.np_random.bit_generator.state = start
+            each.reset()
+            answers.append([np.append(*each.step(action)[:2]) for action in actions])
+        np.testing.assert_array_equal(*answers)
+
+
+def test_a_saved_end_of_an_episode_needs_a_reset():
+    env, other = envs.make("R+N"), envs.make("R+N")
+    env.reset(seed=1)
+    for _ in range(150):
+        env.step(np.zeros(2))
+    state = env.get_state()
+    assert state["actions"] is None and not state["in_episode"]
+    other.reset(seed=3)
+    other.set_state(state)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        other.step(np.zeros(2))
+    np.testing.assert_array_equal(other.reset()[0], env.reset()[0])
+    assert other.executed_actions == 150

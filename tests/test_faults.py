@@ -427,3 +427,25 @@ def test_every_resumption_is_on_record(tmp_path):
         for start in (info, *info["resumed"]):
             assert {"versions", "commit", "platform", "processor", "threads", "device", "started"} <= start.keys()
         assert 0 < info["resumed"][0]["step"] <= info["resumed"][1]["step"] < 60
+
+
+def test_tables_go_back_to_what_a_checkpoint_holds(tmp_path):
+    writer = results.RunWriter(tmp_path / "seed=1", {"tau": 0.5}, {"commit": "a"}, eval_episodes=2)
+    before = writer.tables()
+    assert list(before) == ["evaluations.csv"] and writer.last_finite_evaluation() is None
+    writer.append_evaluation(10, [1.0, 3.0], 0.5)
+    writer.append_statistics(10, {"temperature": 0.1, "entropy": 1 / 3})
+    tables = writer.tables()
+    assert tables["training.csv"] == "step,temperature,entropy\n10,0.1,0.3333333333333333\n"
+    writer.append_evaluation(20, [float("nan"), 1.0], 0.7)
+    writer.append_statistics(20, {"temperature": 0.2, "entropy": float("nan")})
+    assert writer.tables()["training.csv"] == tables["training.csv"] + "20,0.2,nan\n"
+    assert writer.last_finite_evaluation() == {"step": 10, "return_mean": 2.0}
+
+    (tmp_path / "seed=1" / "info.json").write_text("{")  # informs people, and nothing rests on it
+    again = results.RunWriter.resume(tmp_path / "seed=1", {"tau": 0.5}, {"commit": "b"}, eval_episodes=2)
+    again.restore_tables(tables)
+    assert again.tables() == tables and results.read_run(again.folder).config == {"tau": 0.5}
+    assert json.loads((again.folder / "info.json").read_text()) == {"resumed": [{"commit": "b"}]}
+    again.restore_tables(before)
+    assert again.tables() == before and not (again.folder / "training.csv").exists()

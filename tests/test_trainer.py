@@ -1,5 +1,6 @@
 """The training loop, with a scripted environment and an agent whose only parameter counts its gradient steps."""
 
+import errno
 from collections.abc import Sequence
 
 import gymnasium
@@ -369,3 +370,62 @@ def test_counts_of_the_result(tmp_path):
     # Three evaluations and the final one in two environments; each alternates episodes of 7 and 5 steps.
     assert result["executed_actions"] == 50 + 2 * (7 + 5 + 7 + 5)
     assert result["largest_violation"] == -1.0 and result["seeds_in_lockstep"] == 1
+
+
+def test_one_folder_that_cannot_be_written_costs_only_its_own_parameters(tmp_path, capsys):
+    def fail(env):
+        if env.executed_actions == 30:
+            raise BrokenError
+
+    trainer = make_trainer(tmp_path, seeds=(4, 6, 8), fail=fail)
+    save = trainer.writers[1].save_parameters
+
+    def no_space_for_the_last(name, parameters):
+        if name == "last":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(name, parameters)
+
+    trainer.writers[1].save_parameters = no_space_for_the_last
+    with pytest.raises(BrokenError):
+        trainer.run()
+    assert "last parameters not saved" in capsys.readouterr().err
+    assert [(folder(trainer, i) / "last.pt").exists() for i in range(3)] == [True, False, True]
+
+
+def test_an_interrupt_while_the_best_parameters_are_in_place_keeps_the_last_ones(tmp_path):
+    trainer = make_trainer(tmp_path, scores=scores_at({9: 0.4, 29: 0.2, 39: 0.1}))
+    policy, calls = trainer.agent.policy, []
+
+    def interrupted(which):
+        calls.append(saved := trainer.agent.net.count.item())
+        if len(calls) == 4:  # three evaluations, then the policy of the best parameters
+            assert saved == 9
+            raise KeyboardInterrupt
+        return policy(which)
+
+    trainer.agent.policy = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    assert saved_count(trainer, "last") == 39 and saved_count(trainer, "best") == 9
+
+
+def test_statistics_stand_beside_each_evaluation_after_the_first_gradient_step(tmp_path):
+    class Measured(Counter):
+        def statistics(self):
+            return {"count": self.net.count.detach()[:, 0], "double": 2 * self.net.count.detach()[:, 0]}
+
+    config = Config("Counter", "Scripted", steps=50, learning_starts=25, batch_size=4, eval_every=20, eval_episodes=2)
+    config.final_episodes = 2
+    trainer = make_trainer(tmp_path, seeds=(4, 6), agent=Measured(config, [4, 6]))
+    trainer.run()
+    for i in range(2):
+        # No gradient step by step 20; one after each of the steps 26, 27, ... but the last.
+        table = (folder(trainer, i) / "training.csv").read_text()
+        assert table == "step,count,double\n40,14.0,28.0\n50,24.0,48.0\n"
+        assert read_run(folder(trainer, i)).evaluations.step.tolist() == [20, 40, 50]
+
+
+def test_an_algorithm_without_statistics_leaves_no_table(tmp_path):
+    trainer = make_trainer(tmp_path)
+    trainer.run()
+    assert not (folder(trainer) / "training.csv").exists()

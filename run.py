@@ -42,7 +42,7 @@ from core.results import (
     variant_name,
 )
 from core.trainer import Trainer
-from envs import TASKS
+from envs import TASKS, TOLERANCE
 
 
 def usage() -> str:
@@ -110,24 +110,52 @@ def make_trainer(
     progress: bool = True,
     check: Callable[[], None] = lambda: None,
 ) -> Trainer:
-    """The trainer of one cell: its environments and its agent put together; one writer a seed."""
+    """The trainer of one cell: its environments and its agent put together; one writer a seed.
+
+    ConfigError where networks and replay buffer do not fit into memory.
+    """
     algorithm = ALGORITHMS[config.algo]
     train_envs = [envs.make(config.env) for _ in seeds]
-    agent = algorithm.agent(
-        config,
-        envs.constraint(config.env),
-        train_envs[0].observation_space.shape[0],
-        seeds,
-        mapping=algorithm.mapping,
-        placement=algorithm.placement,
-    )
-    return Trainer(config, agent, train_envs, lambda: envs.make(config.env), writers, progress, check)
+    try:
+        agent = algorithm.agent(
+            config,
+            envs.constraint(config.env),
+            train_envs[0].observation_space.shape[0],
+            seeds,
+            mapping=algorithm.mapping,
+            placement=algorithm.placement,
+        )
+        return Trainer(config, agent, train_envs, lambda: envs.make(config.env), writers, progress, check)
+    except RuntimeError as error:
+        if "allocate memory" not in str(error):
+            raise
+        raise ConfigError(
+            f"not enough memory for {len(seeds)} seeds with hidden={config.hidden}, buffer_size={config.buffer_size}"
+        ) from error
+
+
+def check_constraint(task: str) -> None:
+    """ConfigError, before anything is trained, where the constraint of `task` does not work on its robot."""
+    constraint = TASKS[task].constraint
+    env = envs.make(task)
+    try:
+        obs = torch.from_numpy(env.reset(seed=0)[0]).float().unsqueeze(0)
+        if constraint.dim != env.robot.action_dim:
+            raise ValueError(f"it is for {constraint.dim} action coordinates, the robot has {env.robot.action_dim}")
+        action = constraint.project(obs, torch.ones(1, constraint.dim))
+        if action.shape != (1, constraint.dim) or not constraint.violation(obs, action).item() <= TOLERANCE:
+            raise ValueError(f"it projects (1, ..., 1) to {action.tolist()} at a first observation")
+    except Exception as error:  # from code of the user's own
+        raise ConfigError(f"the constraint of {task} does not work: {one_line(error)}") from error
+    finally:
+        env.close()
 
 
 def train(config: Config, base: Config, check: Callable[[], None] = lambda: None) -> bool:
     """Run the seeds of one cell that have not ended, from their checkpoints where there are any, and say what came out
     and where it is. Whether all seeds have a result."""
     torch.set_num_threads(config.threads)
+    check_constraint(config.env)
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     variant = variant_name(config.algo, differences(config, base))
     folders = {seed: run_folder(config.results, config.env, variant, seed) for seed in parse_seeds(config.seed)}
@@ -246,8 +274,11 @@ def main(arguments: list[str]) -> int:
     try:
         with Interrupts() as interrupts:
             done = [train(config, base, interrupts.check) for config, base in plan(arguments)]
-    except (ConfigError, ConstraintError, LockedError, OSError) as error:
+    except (ConfigError, ConstraintError, LockedError) as error:
         print(f"run.py: {one_line(error)}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"run.py: {error.filename or 'system'}: {one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 128 + signal.SIGINT

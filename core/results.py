@@ -223,8 +223,12 @@ class RunWriter:
 
     def _append(self, name: str, row: Sequence[str]) -> None:
         # One write of one line: a reader meanwhile sees it whole, or without its line end.
-        with open(self.folder / name, "a") as file:
-            file.write(",".join(row) + "\n")
+        path = self.folder / name
+        try:
+            with open(path, "a") as file:
+                file.write(",".join(row) + "\n")
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from error
 
     def save_parameters(self, name: str, state_dict: Mapping[str, Any]) -> None:
         """Replace `best.pt` or `last.pt` (`name` "best" or "last") in one step."""

@@ -281,8 +281,8 @@ def test_a_result_that_cannot_be_written_ends_the_run_with_one_line_and_it_can_b
         patch.setattr(results.RunWriter, "_append", fill_disk)
         assert run.main([*WORDS.split(), f"results={tmp_path}"]) == 2
     err = capsys.readouterr().err
-    assert err.splitlines()[-1] == "run.py: no space left on device" and "Traceback" not in err
     (table,) = [path for path in tmp_path.glob("*/*/seed=?/evaluations.csv") if path.is_symlink()]
+    assert err.splitlines()[-1] == f"run.py: {table}: no space left on device" and "Traceback" not in err
     table.unlink()
     train(tmp_path, WORDS)
     assert_identical(outcome(tmp_path), unbroken)

@@ -19,6 +19,7 @@ import hashlib
 import io
 import pickle
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +28,8 @@ import torch
 
 from core.replay import Replay
 from core.results import one_line, replace_file
+
+_DAMAGES = (OSError, ValueError, KeyError, TypeError, RuntimeError, pickle.UnpicklingError)
 
 
 class ReplayFile(NamedTuple):
@@ -150,17 +153,19 @@ class CheckpointFolder:
                         path=path, group=tuple(content["group"]), replay_files=files, **{k: content[k] for k in keys}
                     )
                 )
-            except (OSError, ValueError, KeyError, RuntimeError, pickle.UnpicklingError) as error:
+            except _DAMAGES as error:
                 problems.append(f"{path}: damaged checkpoint: {one_line(error)}")
         return intact, problems
 
-    def resume(self, checkpoint: Checkpoint, intact: Sequence[Checkpoint]) -> None:
-        """Go on from `checkpoint`, one of the `intact` that were read; what is newer is deleted."""
-        self.serial, self.files = checkpoint.serial, list(checkpoint.replay_files)
-        self.previous_files = [file for other in intact if other.serial < self.serial for file in other.replay_files]
+    def resume(self, checkpoint: Checkpoint) -> None:
+        """Go on from `checkpoint`; what is newer is deleted, the one before stays until the next has been written."""
+        self.serial, self.files, self.previous_files = checkpoint.serial, list(checkpoint.replay_files), []
         for path in self.folder.glob("state-*.pt"):
             if _serial_of(path) > self.serial:
                 path.unlink()
+        with suppress(*_DAMAGES):
+            before = _load(self._state_path(self.serial - 1))
+            self.previous_files = [ReplayFile(*file) for file in before["replay_files"]]
 
     def remove(self) -> None:
         """Delete all of it."""

@@ -390,6 +390,7 @@ class Trainer:
             self.replay.added[i] = state["added"]
             self.replay.streams.generators[i].set_state(state["sampling"])
             checkpoint.fill(self.replay, i)
+            self.checkpoints[i].resume(checkpoint)
             self.writers[i].restore_tables(state["tables"])
             if self.best[i]:
                 self.writers[i].save_parameters("best", self.best[i][2])

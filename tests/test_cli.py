@@ -161,22 +161,47 @@ def test_a_run_from_the_shell_and_what_it_leaves(tmp_path):
     assert "SRad" in plot.stdout and list((tmp_path / "figures").glob("*.png"))
 
 
-def test_an_interrupt_leaves_a_usable_state(tmp_path):
+def test_interrupted_by_signals_it_resumes_and_a_second_process_keeps_off(tmp_path, capsys):
     words = ["algo=DPre", "env=R+N", "learning_starts=10", "batch_size=8", "eval_every=20", "eval_episodes=1"]
-    process = subprocess.Popen(
-        [sys.executable, "run.py", *words, f"results={tmp_path}"],
-        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
-        # Whoever runs the tests in the background may have them ignore the signal, and children inherit that.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
-    deadline = time.monotonic() + 60
-    while not list(tmp_path.glob("*/*/seed=0/best.pt")) and time.monotonic() < deadline:
-        time.sleep(0.1)
+    words.append(f"results={tmp_path}")
+
+    def start():
+        return subprocess.Popen(
+            [sys.executable, "run.py", *words],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            # Whoever runs the tests in the background may have them ignore the signal, and children inherit that.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+
+    def wait_for(evaluations):
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            for folder in tmp_path.glob("*/*/seed=0"):
+                if (folder / "best.pt").exists() and len(read_run(folder).evaluations.step) >= evaluations:
+                    return folder
+            time.sleep(0.1)
+        raise AssertionError("no evaluation within a minute")
+
+    process = start()
+    folder = wait_for(evaluations=1)
+    assert run.main(words) == 2
+    assert f"{folder} is being trained by process {process.pid} on " in capsys.readouterr().err
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 128 + signal.SIGINT
     assert "Traceback" not in err and "interrupted" in err
-    (folder,) = tmp_path.glob("*/*/seed=0")
     assert (folder / "last.pt").is_file() and not (folder / "result.json").exists()
-    assert len(read_run(folder).evaluations.step) >= 1
-    assert yaml.safe_load((folder / "config.yaml").read_text())["algo"] == "DPre"
+    before = len(read_run(folder).evaluations.step)
+    assert before >= 1 and yaml.safe_load((folder / "config.yaml").read_text())["algo"] == "DPre"
+
+    process = start()
+    wait_for(evaluations=before + 1)
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM and "Traceback" not in err
+    assert f"{folder}: resuming from step" in out and len(read_run(folder).evaluations.step) > before
+    assert not folder.with_name("seed=0.lock").exists() and not list(folder.parent.glob("*.old-*"))

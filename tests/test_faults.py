@@ -183,6 +183,18 @@ def test_replay_files_hold_each_transition_once_and_go_when_it_is_overwritten(tm
         assert again.rows[50 + (stop - 1) % 50].eq(stop - 1).all()
 
 
+def test_checkpoints_after_a_resumption_join_those_before_it(tmp_path):
+    first, _ = break_off(tmp_path, calls=100)
+    serials = sorted(int(path.stem.split("-")[1]) for path in first.glob("checkpoint/state-*.pt"))
+    replay_files = {path.name for path in first.glob("checkpoint/*.f32")}
+    with pytest.raises(ZeroDivisionError):
+        train(tmp_path, WORDS, Breaks(200, error=ZeroDivisionError()))
+    later = sorted(int(path.stem.split("-")[1]) for path in first.glob("checkpoint/state-*.pt"))
+    assert later[0] == later[1] - 1 and serials[1] < later[1] <= serials[1] + 3
+    assert replay_files < {path.name for path in first.glob("checkpoint/*.f32")}
+    assert not CheckpointFolder(first).read()[1]
+
+
 def test_settings_that_changed_are_not_mixed(tmp_path, capsys, monkeypatch):
     folder, _ = break_off(tmp_path)
     monkeypatch.setitem(config.HYPERPARAMETERS["Reacher", "TD3"], "tau", 0.5)

@@ -1,5 +1,6 @@
 """A run that is interrupted, killed or damaged and taken up again ends with every bit of the run that never was."""
 
+import json
 import multiprocessing
 import random
 import time
@@ -91,6 +92,14 @@ def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path,
     check = Breaks(*range(70, whole.calls, whole.calls // 5))
     assert train_through(tmp_path / "broken", words, check) in (4, 5)
     assert_identical(outcome(tmp_path / "whole"), outcome(tmp_path / "broken"))
+    assert_never_apart(tmp_path / "broken")
+
+
+def assert_never_apart(root):
+    """Wherever seeds 3 and 5 resumed, they did so from the same moment."""
+    for folder in root.glob("*/*/seed=[35]"):
+        info = json.loads((folder / "info.json").read_text())
+        assert all(start["lockstep"] == [3, 5] for start in [info, *info.get("resumed", [])])
 
 
 # ---------------------------------------------------------------- kill -9
@@ -125,3 +134,4 @@ def test_killed_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path, chec
         tmp_path / "broken", f"{words} checkpoint_every={checkpoint_every}", 6, random.Random(checkpoint_every)
     )
     assert_identical(outcome(tmp_path / "whole"), outcome(tmp_path / "broken"))
+    assert_never_apart(tmp_path / "broken")

@@ -72,14 +72,16 @@ class Checkpoint:
 
 
 class CheckpointFolder:
-    """The checkpoints of one run, that is, one seed."""
+    """The checkpoints of one run, that is, one seed: `write` one in every folder of the group, then `keep` them all,
+    or `discard` them all. Only this leaves the seeds with a moment that they share, whatever happens when."""
 
     def __init__(self, run_folder: str | Path):
         self.folder = Path(run_folder) / "checkpoint"
         self.serial = 0
-        # of the newest state file and of the one before it
+        # of the newest state file that is kept, of the one before it, and of one that is neither kept nor discarded yet
         self.files: list[ReplayFile] = []
         self.previous_files: list[ReplayFile] = []
+        self.written: list[ReplayFile] | None = None
 
     def write(
         self,
@@ -91,25 +93,34 @@ class CheckpointFolder:
         replay: Replay,
         i: int,
     ) -> None:
-        """Keep the seed in position i of `replay` at this moment: OSError leaves the checkpoints before it valid."""
+        """Write the state and the new transitions of the seed in position i of `replay`; OSError where that fails."""
         self.folder.mkdir(exist_ok=True)
-        try:
-            files = self._write_replay(replay, i)
-            body = io.BytesIO()
-            content = {"serial": self.serial + 1, "moment": moment, "group": list(group), "step": step}
-            content |= {"settings": dict(settings), "replay_files": [list(file) for file in files]}
-            torch.save(content | {"state": dict(state)}, body)
-            digest = hashlib.sha256(body.getbuffer()).hexdigest().encode() + b"\n"
-            path = self._state_path(self.serial + 1)
-            replace_file(path, lambda file: file.writelines([digest, body.getbuffer()]))
-        except OSError:
-            self._delete_unused()
-            raise
-        self.serial, self.files, self.previous_files = self.serial + 1, files, self.files
-        self._delete_unused()
+        files = self._write_replay(replay, i)
+        content = {"serial": self.serial + 1, "moment": moment, "group": list(group), "step": step}
+        content |= {"settings": dict(settings), "replay_files": [list(file) for file in files]}
+        body = io.BytesIO()
+        torch.save(content | {"state": dict(state)}, body)
+        digest = hashlib.sha256(body.getbuffer()).hexdigest().encode() + b"\n"
+        path = self._state_path(self.serial + 1)
+        replace_file(path, lambda file: file.writelines([digest, body.getbuffer()]))
+        self.written = files
+
+    def keep(self) -> None:
+        """Make what was written the newest checkpoint, and delete those that are older than the one before it."""
+        self.serial, self.files, self.previous_files = self.serial + 1, self.written, self.files
+        self.discard()
+
+    def discard(self) -> None:
+        """Delete everything but the newest two checkpoints that are kept."""
+        self.written = None
+        used = {self._state_path(serial).name for serial in (self.serial, self.serial - 1)}
+        used |= {file.name for file in (*self.files, *self.previous_files)}
+        for path in self.folder.iterdir():
+            if path.name not in used:
+                path.unlink()
 
     def _write_replay(self, replay: Replay, i: int) -> list[ReplayFile]:
-        """Write the transitions added since the last checkpoint; the files with all that are in the buffer now."""
+        """Write the transitions added since the newest checkpoint; the files with all that are in the buffer now."""
         stop = replay.added[i]
         oldest = max(0, stop - replay.capacity)
         files = [file for file in self.files if file.stop > oldest]
@@ -125,14 +136,6 @@ class CheckpointFolder:
 
     def _state_path(self, serial: int) -> Path:
         return self.folder / f"state-{serial}.pt"
-
-    def _delete_unused(self) -> None:
-        """Delete all but the newest two state files and the replay files that they name."""
-        used = {self._state_path(serial).name for serial in (self.serial, self.serial - 1)}
-        used |= {file.name for file in (*self.files, *self.previous_files)}
-        for path in self.folder.iterdir():
-            if path.name not in used:
-                path.unlink()
 
     def read(self) -> tuple[list[Checkpoint], list[str]]:
         """The intact checkpoints, newest first, and a line for each that is not."""

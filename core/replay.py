@@ -31,6 +31,7 @@ class Replay:
         self.widths = [obs_dim, action_dim, 1, 1, obs_dim] + [action_dim] * (2 if centers else 0)
         self.rows = torch.empty(len(seeds) * capacity, sum(self.widths))
         self.offsets = torch.arange(len(seeds)).unsqueeze(1) * capacity
+        self.rows[self.offsets] = 0.0  # what a seed without transitions samples: one that failed at its first step
         self.added = [0] * len(seeds)
         self.streams = Streams(seeds, "replay")
 
@@ -52,7 +53,7 @@ class Replay:
 
     def sample(self, batch_size: int) -> Batch:
         """`batch_size` transitions of every seed, uniform with replacement."""
-        sizes = [min(n, self.capacity) for n in self.added]
+        sizes = [min(max(n, 1), self.capacity) for n in self.added]
         indices = self.streams.indices(sizes, batch_size) + self.offsets
         rows = self.rows.index_select(0, indices.flatten()).view(*indices.shape, -1)
         obs, action, reward, terminated, next_obs, *centers = rows.split(self.widths, dim=-1)

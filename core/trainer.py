@@ -11,7 +11,7 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import gymnasium
@@ -300,7 +300,8 @@ class Trainer:
             "steps": self.steps[i],
             "gradient_steps": self.gradient_steps[i],
             "executed_actions": sum(env.executed_actions for env in envs),
-            "largest_violation": max(env.largest_violation for env in envs),
+            # (no number before the first action: JSON has no infinity)
+            "largest_violation": max((env.largest_violation for env in envs if env.executed_actions), default=None),
             "seconds": self.seconds | {"total": self._elapsed()},
         }
 
@@ -336,7 +337,7 @@ class Trainer:
             try:
                 self.writers[i].save_parameters("last", self.agent.state(i))
             except OSError as error:
-                print(f"last parameters not saved: {error}", file=sys.stderr)
+                print(f"{error.filename}: last parameters not saved: {one_line(error)}", file=sys.stderr)
 
     def _checkpoint(self) -> None:
         """Write a checkpoint of every seed. Where that fails, the one before stays, and training goes on."""
@@ -350,8 +351,13 @@ class Trainer:
                 for i, folder in enumerate(self.checkpoints):
                     settings = self.writers[i].config
                     folder.write(moment, self.seeds, self.steps[i], settings, self._state(i), self.replay, i)
+                for folder in self.checkpoints:
+                    folder.keep()
             except OSError as error:
                 print(f"no checkpoint at step {max(self.steps)}: {one_line(error)}", file=sys.stderr)
+                for folder in self.checkpoints:
+                    with suppress(OSError):
+                        folder.discard()
 
     def _state(self, i: int) -> dict[str, Any]:
         """Everything about the seed in position i but its transitions."""

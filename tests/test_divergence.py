@@ -164,6 +164,26 @@ def test_an_action_that_is_not_finite(tmp_path, monkeypatch, algo):
     assert name == "seed=5" and failure["quantity"] == "suggested action [nan, nan] is not finite"
 
 
+def test_a_seed_that_fails_at_its_first_step(tmp_path, monkeypatch):
+    warm_up = ALGORITHMS["DPre"].agent.warm_up
+
+    def spoiled(self, only):
+        suggested = warm_up(self, only)
+        suggested[BAD] = math.inf
+        return suggested
+
+    words = f"algo=DPre env=R+N {WORDS}"
+    train(tmp_path / "sound", words)
+    monkeypatch.setattr(ALGORITHMS["DPre"].agent, "warm_up", spoiled)
+    assert run.main([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
+    ((name, failure),) = failures(tmp_path / "spoiled").items()
+    assert name == "seed=5" and (failure["step"], failure["executed_actions"]) == (0, 0)
+    assert failure["last_evaluation"] is None and failure["largest_violation"] is None
+    assert json.loads(json.dumps(failure)) == failure
+    sound = outcome(tmp_path / "sound")
+    assert_identical({seed: sound[seed] for seed in ("seed=3", "seed=8")}, outcome_of_finished(tmp_path / "spoiled"))
+
+
 def test_a_map_that_gives_an_infeasible_action_ends_the_seed_and_says_by_how_much(tmp_path, monkeypatch):
     feasible = ALGORITHMS["DPro"].agent.feasible
 

@@ -166,6 +166,7 @@ def test_replay_files_hold_each_transition_once_and_go_when_it_is_overwritten(tm
         replay.add([1], *(torch.full((2, width), float(number)) for width in replay.widths))
         if number % 20 == 19:
             folder.write("moment", (2,), number, {}, {"number": number}, replay, 1)
+            folder.keep()
             kept_files.append(sorted(path.name for path in (tmp_path / "checkpoint").glob("*.f32")))
     assert kept_files[:3] == [["replay-0-20.f32"]] * 1 + [
         ["replay-0-20.f32", "replay-20-40.f32"],
@@ -262,6 +263,31 @@ def test_a_disk_without_room_for_a_checkpoint_does_not_end_the_training(
     err = capsys.readouterr().err
     assert refused and err.count("no checkpoint at step") == len(refused) and "no space left on device" in err.lower()
     assert not list(tmp_path.rglob("*.tmp"))
+    assert_identical(outcome(tmp_path), unbroken)
+
+
+def test_checkpoints_that_did_not_fit_leave_the_seeds_with_a_moment_that_they_share(tmp_path, monkeypatch, unbroken):
+    """Seed 3's file fits each time, seed 5's never does."""
+    first, second = break_off(tmp_path)
+    fsync = os.fsync
+
+    def full(descriptor):
+        if "seed=5/checkpoint" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            no_space()
+        fsync(descriptor)
+
+    before = [[path.name for path in sorted(folder.glob("checkpoint/state-*"))] for folder in (first, second)]
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(ZeroDivisionError):
+            train(
+                tmp_path,
+                WORDS.replace("checkpoint_every=10", "checkpoint_every=2"),
+                Breaks(200, error=ZeroDivisionError()),
+            )
+    after = [[path.name for path in sorted(folder.glob("checkpoint/state-*"))] for folder in (first, second)]
+    assert after == before
+    train(tmp_path, WORDS)
     assert_identical(outcome(tmp_path), unbroken)
 
 

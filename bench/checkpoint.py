@@ -1,6 +1,9 @@
-"""What a checkpoint costs with a full replay buffer: `python bench/checkpoint.py [seeds=1,10] [env=HC+O] [folder=DIR]`.
+"""What a checkpoint costs with a full replay buffer.
 
-For each number of seeds in lockstep, with a million transitions a seed (synthetic: only their size matters): time and
+    python bench/checkpoint.py                                               # HC+O, a million transitions
+    python bench/checkpoint.py seeds=4 env=R+L2 transitions=2e5 folder=DIR   # DIR: on the disk to be measured
+
+For each number of seeds in lockstep, with as many transitions a seed (synthetic: only their size matters): time and
 bytes of a checkpoint after `checkpoint_every` steps, of one that has to write the whole buffer, and of resuming; the
 memory that writing needs beside the training's; and the share of the training's time, from the time of a gradient
 step measured here.
@@ -25,8 +28,6 @@ from core.checkpoint import CheckpointFolder
 from core.config import saved_settings
 from core.results import RunWriter
 
-TRANSITIONS = 1_000_000
-
 
 def megabytes(folder: Path) -> float:
     return sum(path.stat().st_size for path in folder.glob("*/checkpoint/*")) / 1e6
@@ -50,14 +51,15 @@ def measure(config, count: int, folder: Path) -> None:
     trainer = run.make_trainer(config, seeds, writers, progress=False)
     trainer._begin()
     trainer.replay.rows.uniform_()
-    trainer.replay.added = [TRANSITIONS] * count
+    transitions = trainer.replay.capacity
+    trainer.replay.added = [transitions] * count
     update = min(timed(lambda: trainer.agent.update(trainer.replay.sample(config.batch_size))) for _ in range(10))
     for i in seeds:
         trainer.best[i] = (0.0, 0, trainer.agent.state(i))
 
     before = peak()
     whole = timed(trainer._checkpoint), megabytes(folder)
-    trainer.replay.added = [TRANSITIONS + config.checkpoint_every] * count
+    trainer.replay.added = [transitions + config.checkpoint_every] * count
     seconds = timed(trainer._checkpoint)
     written = megabytes(folder) - whole[1]
     training = config.checkpoint_every * update
@@ -77,8 +79,10 @@ def measure(config, count: int, folder: Path) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    options = {"seeds": "1,10", "env": "HC+O", "folder": None} | dict(word.split("=", 1) for word in arguments)
-    ((config, _),) = run.plan(["algo=DPre", f"env={options['env']}"])
+    options = {"seeds": "1,10", "env": "HC+O", "transitions": "1e6", "folder": None}
+    options |= dict(word.split("=", 1) for word in arguments)
+    size = options["transitions"]
+    ((config, _),) = run.plan(["algo=DPre", f"env={options['env']}", f"buffer_size={size}", f"steps={size}"])
     torch.set_num_threads(1)
     for count in map(int, options["seeds"].split(",")):
         with tempfile.TemporaryDirectory(dir=options["folder"]) as folder:

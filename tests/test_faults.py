@@ -487,3 +487,14 @@ def test_tables_go_back_to_what_a_checkpoint_holds(tmp_path):
     assert json.loads((again.folder / "info.json").read_text()) == {"resumed": [{"commit": "b"}]}
     again.restore_tables(before)
     assert again.tables() == before and not (again.folder / "training.csv").exists()
+
+
+def test_the_cost_of_checkpoints_can_be_measured(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "bench/checkpoint.py", "seeds=2", "env=R+L2", "transitions=2e4", f"folder={tmp_path}"],
+        cwd=ROOT, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for said in ("seeds=2: a gradient step takes", "whole buffer:", "after 10000 steps:", "memory:", "resuming:"):
+        assert said in done.stdout
+    assert not list(tmp_path.iterdir())

@@ -347,7 +347,7 @@ def read_run(folder: str | Path) -> Run:
 def read_results(
     root: str | Path, tasks: Collection[str] | None = None, algos: Collection[str] | None = None
 ) -> tuple[list[Run], list[str]]:
-    """All readable runs below `root` (of the given tasks and algorithms), and a line for each that is not or failed."""
+    """All readable runs below `root` (of the given tasks and algorithms), and a line for each that is not."""
     runs, problems = [], []
     for folder in find_runs(root):
         if tasks is not None and folder.parent.parent.name not in tasks:
@@ -355,13 +355,9 @@ def read_results(
         if algos is not None and parse_variant(folder.parent.name)[0] not in algos:
             continue
         try:
-            run = read_run(folder)
+            runs.append(read_run(folder))
         except ValueError as error:
             problems.append(str(error))
-            continue
-        runs.append(run)
-        if run.failure:
-            problems.append(f"{folder}: {describe_failure(run.failure)}")
     return runs, problems
 
 

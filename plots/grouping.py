@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from core.config import RUN_KEYS
-from core.results import Run
+from core.results import Run, describe_failure
 from plots.paper import Statistic, order_algos, order_tasks
 
 
@@ -101,6 +101,8 @@ def order_conditions(conditions: Iterable[Condition]) -> list[list[Condition]]:
 
 def final_return(run: Run) -> float | None:
     """The mean return that the run ended with: None while it is unfinished, not finite if it failed."""
+    if run.failure:
+        return math.nan
     return None if run.result is None else float(run.result["return_mean"])
 
 
@@ -127,19 +129,23 @@ def list_left_out(groups: Groups) -> list[str]:
     for condition in chain.from_iterable(order_conditions(groups)):
         for algo in order_algos(groups[condition]):
             runs = groups[condition][algo]
-            if unfinished := [run for run in runs if not run.finished]:
+            if unfinished := [run for run in runs if final_return(run) is None]:
                 reached = [run.evaluations.step.max(initial=0) for run in unfinished]
                 span = " to ".join(f"{step:,}" for step in sorted({min(reached), max(reached)}))
                 total = unfinished[0].config.get("steps")
                 of = f" of {total:,}" if isinstance(total, int) else ""
                 lines.append(f"{condition.label} {algo}: seed {_seeds(unfinished)}, evaluated to step {span}{of}")
+            for run in runs:
+                if run.failure:
+                    lines.append(f"{condition.label} {algo}: seed {run.seed} {describe_failure(run.failure)}")
             if failed := [run for run in runs if run.finished and not math.isfinite(final_return(run))]:
                 lines.append(f"{condition.label} {algo}: seed {_seeds(failed)} failed, its return is not a number")
     return lines
 
 
 def count_failed(runs: Iterable[Run]) -> int:
-    return Counter(run.finished and not math.isfinite(final_return(run)) for run in runs)[True]
+    returns = [final_return(run) for run in runs]
+    return sum(value is not None and not math.isfinite(value) for value in returns)
 
 
 def _seeds(runs: Iterable[Run]) -> str:

@@ -14,6 +14,7 @@ from algos import ALGORITHMS
 from core.random import stream_seed
 from core.results import read_results, read_run
 from envs import ActionConstrainedEnv
+from plots.grouping import count_failed, group_runs, list_left_out
 
 WORDS = (
     "seed=3,5,8 steps=120 learning_starts=40 batch_size=8 hidden=[8,8] eval_every=60 eval_episodes=1 final_episodes=1"
@@ -98,7 +99,11 @@ def test_a_failed_run_is_reported_and_not_run_again_unless_asked(tmp_path, monke
     said = f"{folder}: failed at step 86: critic loss is not finite"
     assert said in capsys.readouterr().err
     runs, problems = read_results(tmp_path)
-    assert problems == [said] and len(runs) == 3
+    assert problems == [] and len(runs) == 3
+    (line,) = list_left_out(groups := group_runs(runs)[0])
+    assert line.endswith("DPre: seed 5 failed at step 86: critic loss is not finite")
+    ((cell,),) = [by_algo.values() for by_algo in groups.values()]
+    assert count_failed(cell) == 1
     failed = read_run(folder)
     assert failed.failure["step"] == 86 and not failed.finished and failed.evaluations.step.tolist() == [60]
     assert not (folder / "checkpoint").exists() and (folder / "last.pt").is_file()

@@ -99,6 +99,7 @@ class Malicious:
         return os.mkdir, ("executed",)
 
 
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 def test_a_checkpoint_executes_nothing(tmp_path, capsys, monkeypatch, unbroken):
     monkeypatch.chdir(tmp_path)
     first, _ = break_off(tmp_path)

@@ -29,8 +29,8 @@ def settings(algo, task):
 def test_pair(tmp_path, capsys, monkeypatch, algo, task):
     chosen, fresh = settings(algo, task), {}
 
-    def make_trainer(*arguments):
-        trainer = original(*arguments)
+    def make_trainer(*arguments, **options):
+        trainer = original(*arguments, **options)
         fresh.update(trainer.agent.state(0))
         return trainer
 

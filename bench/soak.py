@@ -141,7 +141,7 @@ class Soak:
         width = self.robot.obs_dim
         size = 10.0 ** (3 * torch.rand(n, 1, generator=self.generator) - 2)
         ordinary = (size * self.normal(n, width)).double() * (1 + 1e-9)  # no float32 has these digits
-        extreme = self.pick(EXTREMES, n, width).double().clamp(-1e15, 1e15)
+        extreme = self.pick(EXTREMES, n, width).double().clamp(-1e30, 1e30)
         share = self.pick([0.0, 0.2, 1.0], n, 1)
         obs = torch.where(torch.rand(n, width, generator=self.generator) < share, extreme, ordinary)
         angles = ANGLES[self.robot.__name__]

@@ -89,6 +89,8 @@ class _WeightPatterns(Constraint):
         turns = center * direction < 0.0
         crossing = torch.where(turns, -center / direction, 0.0).clamp(max=1e300)
         point = torch.addcmul(center.unsqueeze(-2), crossing.unsqueeze(-1), direction.unsqueeze(-2))
+        # What crosses is 0: its rounding, times a large weight, would exceed the bound.
+        point.masked_fill_(crossing.unsqueeze(-2) == crossing.unsqueeze(-1), 0.0)
         value = (self._row(weight.unsqueeze(-2), point) * point).sum(-1)
         last = ((value <= self.bound) * crossing).amax(-1, keepdim=True)
         before = torch.where(center == 0.0, direction, center)

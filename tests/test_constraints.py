@@ -260,6 +260,17 @@ def test_large_directions_stay_finite_in_float32(task):
         assert violation.abs().max() < 1e-6  # on the boundary
 
 
+@pytest.mark.parametrize("name", ["R+M", "H+M", "W+M", "HC+MA"])
+@pytest.mark.parametrize("speed", [1e12, 1e15, 1e18, 1e30])
+def test_rays_off_centre_are_exact_at_any_velocity(name, speed):
+    """Where a coordinate crosses 0 its rounding, times such a velocity, would exceed any bound."""
+    task = TASKS[name]
+    obs, action = sample_obs(task, 500, 19, largest=1.0), sample_action(task, 500, 19, 3.0)
+    velocities(obs).mul_(speed)
+    for mapped in (task.constraint.alpha_map(obs, action), task.constraint.radial_map(obs, action)):
+        assert task.constraint.violation(obs, mapped).max() <= 1e-9
+
+
 @every_task
 def test_alpha_map_keeps_feasible_points_and_stops_at_the_boundary(task):
     obs, action = sample_obs(task, 200, 7), sample_action(task, 200, 7)

@@ -101,7 +101,7 @@ def comparison_table(groups: Groups) -> Table:
                 records.append(record | {"difference": difference, "joint_errors": joint})
         if rows:
             sections.append(rows)
-    title = "Comparison with the paper; the last column is the difference in joint standard errors"
+    title = "Comparison with the paper; the difference also in joint standard errors, where there are several seeds"
     header = ["Condition", "Algorithm", "Ours", "Paper", "Difference", "In joint s.e."]
     return Table("comparison", title, header, 2, sections, records)
 

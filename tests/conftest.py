@@ -3,6 +3,7 @@
 
 import os
 
+import pytest
 import torch
 from hypothesis import settings
 
@@ -11,3 +12,10 @@ settings.register_profile("long", max_examples=1000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def denormal_numbers():
+    """Training flushes them to zero in the whole process; the tests after it may need them."""
+    yield
+    torch.set_flush_denormal(False)

@@ -35,8 +35,10 @@ _NO_INTERIOR = 1e-9
 # Constraints this near to the solution are active.
 _ACTIVE = 1e-9
 _NEWTON_STEPS = 4
-_POLISH_STEPS = 10
+_PROGRAMS = 60  # mostly 2 to 10 are enough
+_CONVERGED = 1e-9  # a last step of quadratic convergence
 _PROXIMAL_STEP = 1e3
+_PROXIMAL_STEPS = 3
 _LARGEST_PROGRAM = 20_000  # rows of one block-diagonal linear program
 
 
@@ -242,11 +244,13 @@ def _optimum(sets: _Sets, aim: Tensor, linear: bool) -> tuple[Tensor, Tensor]:
     solution, exact, done = _newton(sets, target, point, multipliers)
     left = (~done).nonzero().squeeze(-1)
     if len(left) > 0:
-        # Raises where there is no interior.
+        # From the deepest point: a start near the boundary may be what went wrong. Raises where there is no interior.
         part = sets[left]
-        inside = _interior(part)
+        inside = _deepest(part)
         target, point, multipliers = _near_optimum(part, aim[left], linear, inside)
-        point, exact[left] = _sequential_programs(part, target, point, multipliers)
+        for _ in range(_PROXIMAL_STEPS if linear else 1):
+            point, exact[left] = _sequential_programs(part, target, point, multipliers)
+            target, multipliers = point + _PROXIMAL_STEP * aim[left], exact[left]
         solution[left] = _pull_towards(part, inside, point)
     return solution, exact
 
@@ -297,8 +301,9 @@ def _slack(sets: _Sets, point: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sequential_programs(sets: _Sets, target: Tensor, point: Tensor, multipliers: Tensor) -> tuple[Tensor, Tensor]:
-    """Sequential quadratic programming, which finds the active constraints by itself."""
-    for _ in range(_POLISH_STEPS):
+    """Sequential quadratic programming, which finds the active constraints by itself. A ConstraintError names a sample
+    that does not converge."""
+    for _ in range(_PROGRAMS):
         root = torch.linalg.cholesky(_metric(sets, multipliers))
         limits, normals = _slack(sets, point)
         normals = torch.linalg.solve_triangular(root, normals.mT, upper=False).mT
@@ -307,8 +312,10 @@ def _sequential_programs(sets: _Sets, target: Tensor, point: Tensor, multipliers
         step, multipliers = project_on_rows(normals / norm.unsqueeze(-1), limits / norm, goal, sets.name, 0)
         step = torch.linalg.solve_triangular(root.mT, step.unsqueeze(-1), upper=True).squeeze(-1)
         point, multipliers = point + step, multipliers / norm
-        if bool((step.abs().amax(-1) <= 1e-14).all()):
+        length = step.abs().amax(-1)
+        if bool((length <= 1e-14).all()):
             break
+    require(length <= _CONVERGED, "the closest point was not found", sets.name)
     return point, multipliers
 
 

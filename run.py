@@ -157,6 +157,11 @@ def train(config: Config, base: Config, check: Callable[[], None] = lambda: None
     torch.set_num_threads(config.threads)
     check_constraint(config.env)
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
+    if config.steps <= config.learning_starts:
+        print(
+            f"note: steps={config.steps} is not more than learning_starts={config.learning_starts}: nothing is learned",
+            file=sys.stderr,
+        )
     variant = variant_name(config.algo, differences(config, base))
     folders = {seed: run_folder(config.results, config.env, variant, seed) for seed in parse_seeds(config.seed)}
     with ExitStack() as locks:
@@ -194,11 +199,13 @@ def _find_checkpoints(folders: dict[int, Path], ended: set[int]) -> tuple[list[d
     intact, started = {}, {}
     for seed, folder in folders.items():
         checkpoints, problems = CheckpointFolder(folder).read()
+        if not checkpoints and seed in ended:  # what a death while they were deleted has left
+            CheckpointFolder(folder).remove()
+            continue
         for problem in problems:
             print(problem, file=sys.stderr)
-        if checkpoints or seed not in ended:
-            intact[seed] = checkpoints
-            started[seed] = checkpoints[0].group if checkpoints else lockstep_group(folder)
+        intact[seed] = checkpoints
+        started[seed] = checkpoints[0].group if checkpoints else lockstep_group(folder)
     groups, fresh = choose(intact, started)
     return groups, [seed for seed in fresh if seed not in ended]
 
@@ -241,7 +248,7 @@ def _run(trainer: Trainer) -> None:
         results = trainer.run()
     except (Interrupted, KeyboardInterrupt):
         print(
-            f"\ninterrupted at step {max(trainer.steps)}; the same command resumes"
+            f"\ninterrupted at step {max(trainer.steps)}; the same command resumes (without overwrite=true)"
             f" (unfinished runs are in {trainer.writers[0].folder.parent})",
             file=sys.stderr,
         )

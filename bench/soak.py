@@ -6,7 +6,7 @@
 Suggestions come from random networks with exploding weights, from a list of extreme numbers (up to 3e38, denormal,
 -0.0, infinite, NaN) and from the boundary of the set. In the simulators each is mapped and executed in float32, as in
 training, and the environment checks it in float64. The checks without simulator take observations no robot reaches:
-velocities of zero, denormal and up to 1e15, angles up to 7. (A map sees them in float32. Of an angle of 1e5 that leaves
+velocities of zero, denormal and up to 1e30, angles up to 7. (A map sees them in float32. Of an angle of 1e5 that leaves
 too little for its sine, which the check in float64 would notice.) Suggestions that are not finite must be refused,
 clearly; everything else must be executed with a violation of at most 1e-6.
 
@@ -28,7 +28,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import envs
-from core.config import split_names
+from core.config import ConfigError, choose, split_names
 from core.networks import MLP
 from envs import TASKS, TOLERANCE, InfeasibleActionError
 
@@ -168,12 +168,32 @@ def soak(tasks: list[str], steps: int, checks: int, seed: int, parallel: int = 5
     return soaks
 
 
-def main(arguments: list[str]) -> int:
+def choices(arguments: list[str]) -> tuple[list[str], int, int, int]:
+    """Tasks, steps, checks and seed that the `key=value` words ask for; ConfigError for a wrong one."""
     options = {"env": "all", "steps": "1e6", "checks": "1e7", "seed": "0"}
-    options |= dict(word.split("=", 1) for word in arguments)
+    for word in arguments:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise ConfigError(f"expected key=value, got {word!r}")
+        options[choose("key", key, options)] = value
+    counts = []
+    for key in ("steps", "checks", "seed"):
+        try:
+            counts.append(int(float(options[key])))
+        except ValueError:
+            raise ConfigError(f"bad value {options[key]!r} for {key}: expected a whole number") from None
+    return split_names("task", options["env"], TASKS), *counts
+
+
+def main(arguments: list[str]) -> int:
+    """Exit code: 0 no violation, 1 violations, 2 bad input."""
+    try:
+        tasks, steps, checks, seed = choices(arguments)
+    except ConfigError as error:
+        print(f"bench/soak.py: {error}", file=sys.stderr)
+        return 2
     torch.set_num_threads(1)
-    tasks = split_names("task", options["env"], TASKS)
-    soaks = soak(tasks, int(float(options["steps"])), int(float(options["checks"])), int(options["seed"]))
+    soaks = soak(tasks, steps, checks, seed)
     print(f"{'largest violation':17s} " + " ".join(f"{name:>12s}" for name in MAPS))
     for result in soaks:
         print(f"{result.task:17s} " + " ".join(f"{result.largest[name]:12.1e}" for name in MAPS))

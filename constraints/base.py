@@ -110,6 +110,8 @@ class Constraint(ABC):
     def center(self, obs: Tensor) -> Tensor:
         """Interior point (..., d): Chebyshev centre of a linear set, an ellipse's centre otherwise, the origin where
         both are present (paper, "alpha-Projection Layer")."""
+        if not obs.is_floating_point():
+            raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
         with torch.no_grad():
             center = self._center(obs.detach().double())
             return center.expand(*obs.shape[:-1], self.dim).to(obs.dtype)
@@ -130,7 +132,7 @@ class Constraint(ABC):
     def ray(self, obs: Tensor, action: Tensor, center: Tensor | None = None) -> Ray:
         """The ray from the centre through `action`: one evaluation of the gauge that serves a map and its density.
 
-        Actions are at most 1e150 long; beyond, a map may return NaN.
+        Offsets are at most 1e150 long, as the squares of longer ones are infinite.
         """
         obs64, action64 = self._broadcast(obs, action)
         if center is None and not self.origin_centered:
@@ -176,6 +178,8 @@ class Constraint(ABC):
     def _broadcast(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         if action.shape[-1] != self.dim:
             raise ValueError(f"expected {self.dim} action coordinates, got {action.shape[-1]}")
+        if not action.is_floating_point():
+            raise TypeError(f"expected float32 or float64 actions, got {action.dtype}")
         obs, action = obs.detach().double(), action.double()
         if obs.shape[:-1] != action.shape[:-1]:
             action = action.expand(*torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1]), self.dim)

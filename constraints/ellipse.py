@@ -19,6 +19,7 @@ from constraints.base import (
 from constraints.separable import BoxProblem, RowProblem, minimize_under_ellipse
 
 _ROUNDING = 1e-13
+_FLAT = 1e-280
 # Newton needs 3 to 10 steps.
 _MAX_STEPS = 40
 
@@ -256,17 +257,18 @@ def ellipse_gauge_gradient(
 
     1 / L is the positive root of the quadratic in t at center + t direction.
     """
+    # Written so that a NaN is passed on. What is flat does not bound the ray; it may be next to 0 by rounding.
     curvature = (direction * bent_direction).sum(-1, keepdim=True)
     if center is None or bent_center is None:
-        met = curvature > 0.0
-        root = (torch.where(met, curvature, 1.0) * bound).sqrt()
-        return torch.where(met, bent_direction / root, 0.0)
+        flat = curvature < _FLAT
+        root = (torch.where(flat, 1.0, curvature) * bound).sqrt()
+        return torch.where(flat, 0.0, bent_direction / root)
     slope = (bent_center * direction).sum(-1, keepdim=True)
     slack = bound - (bent_center * center).sum(-1, keepdim=True)
     square = slope**2 + curvature * slack
-    met = square > 0.0
-    root = torch.where(met, square, 1.0).sqrt()
-    return torch.where(met, (bent_center + (slope * bent_center + slack * bent_direction) / root) / slack, 0.0)
+    flat = square < _FLAT
+    root = torch.where(flat, 1.0, square).sqrt()
+    return torch.where(flat, 0.0, (bent_center + (slope * bent_center + slack * bent_direction) / root) / slack)
 
 
 def _check_bound(bound: float) -> None:

@@ -158,12 +158,12 @@ def parse_arguments(arguments: Iterable[str]) -> dict[str, str]:
 
 
 def split_names(kind: str, value: str, choices: Iterable[str]) -> list[str]:
-    """A comma list of names, or `all`, in the order of `choices`; ConfigError names a wrong one."""
+    """A comma list of names in its order, or `all` in that of `choices`; ConfigError names a wrong one."""
     choices = list(choices)
     if value == "all":
         return choices
-    wanted = {choose(kind, name, [*choices, "all"]) for name in value.split(",")}
-    return choices if "all" in wanted else [name for name in choices if name in wanted]
+    wanted = [choose(kind, name, [*choices, "all"]) for name in value.split(",")]
+    return choices if "all" in wanted else list(dict.fromkeys(wanted))
 
 
 def parse_seeds(text: str) -> list[int]:

@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import chain, cycle
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,7 @@ def _draw_condition(
     for algo in evaluated:
         _draw_curve(axes, algo, learning_curve(by_algo[algo]), label=_legend(algo, by_algo[algo]))
     _label_axes(axes, "Evaluation return (mean ± standard error)")
-    axes.set_title(condition.label)
+    axes.set_title(fill(condition.label, 60))
     figure.legend(loc="outside right upper", frameon=False)
     return save(figure, folder, condition.label.replace(", ", ","), formats)
 
@@ -81,8 +82,15 @@ def _draw_training(
     task: str, by_settings: dict[str, dict[str, list[Run]]], folder: Path, formats: Sequence[str]
 ) -> list[Path]:
     """Returns and training measures side by side, of all runs with such: a line style for each of the settings."""
+    words = {settings: dict.fromkeys(filter(None, settings.split(", "))) for settings in by_settings}
+    common = [word for word in next(iter(words.values())) if all(word in others for others in words.values())]
     curves = [
-        (algo, style, ", ".join(filter(None, (_legend(algo, by_algo[algo]), settings))), by_algo[algo])
+        (
+            algo,
+            style,
+            ", ".join([_legend(algo, by_algo[algo]), *(word for word in words[settings] if word not in common)]),
+            by_algo[algo],
+        )
         for (settings, by_algo), style in zip(by_settings.items(), cycle(LINE_STYLES), strict=False)
         for algo in order_algos(by_algo)
         if any(run.training for run in by_algo[algo])
@@ -107,8 +115,9 @@ def _draw_training(
             axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axes.yaxis.set_minor_locator(NullLocator())
             axes.yaxis.set_major_formatter("{x:g}")
-    figure.suptitle(f"{task} (mean ± standard error)")
-    figure.legend(loc="outside lower center", ncols=min(len(curves), 3), frameon=False)
+    figure.suptitle(fill(", ".join([f"{task} (mean ± standard error)", *common]), 110))
+    longest = max(len(label) for _, _, label, _ in curves)
+    figure.legend(loc="outside lower center", ncols=max(1, min(len(curves), 100 // (longest + 8))), frameon=False)
     return save(figure, folder, f"{task}-training", formats)
 
 

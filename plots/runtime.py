@@ -28,6 +28,8 @@ Seconds = dict[tuple[str, int], list[tuple[float, float]]]
 
 def read_runtime(path: Path) -> list[dict]:
     """The rows of the file, numbers as such. Raises ConfigError for another kind of file, or an empty one."""
+    if not path.is_file():
+        raise ConfigError(f"{path} is not a file (bench/runtime.py makes it)")
     with open(path, newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         rows = list(reader)

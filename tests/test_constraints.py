@@ -561,3 +561,29 @@ def test_wrong_arguments_are_refused():
         Box(0)
     with pytest.raises(ValueError, match="coordinates"):
         Box(2).project(torch.zeros(4), torch.zeros(3))
+    # Their results would be cut to whole numbers.
+    for method in (Box(2).project, Box(2).alpha_map, Box(2).linear_oracle, Box(2).violation):
+        with pytest.raises(TypeError, match="int64"):
+            method(torch.zeros(4), torch.ones(2, dtype=torch.int64))
+    with pytest.raises(TypeError, match="int64"):
+        Box(2).center(torch.zeros(4, dtype=torch.int64))
+
+
+@every_task
+def test_nan_in_the_observation_is_passed_on(task):
+    obs, action = sample_obs(task, 20, 20), 0.1 * sample_action(task, 20, 20)
+    obs[:] = math.nan
+    if isinstance(task.constraint, Box | Ball) or task is TASKS["disc"]:
+        return  # they do not look at it
+    for function in (task.constraint.project, task.constraint.alpha_map, task.constraint.radial_map):
+        assert function(obs, action).isnan().any(-1).all()
+
+
+def test_ellipses_next_to_nothing_do_not_bound_a_ray():
+    tiny = 2e-81
+    constraint = PlanarEllipse(
+        lambda obs: torch.tensor([[0.0, 0.0], [0.0, tiny**2]], dtype=torch.float64).expand(*obs.shape[:-1], 2, 2), 0.05
+    )
+    action = torch.tensor([0.0, tiny], dtype=torch.float64)
+    for mapped in (constraint.alpha_map(torch.zeros(1), action), constraint.radial_map(torch.zeros(1), action)):
+        torch.testing.assert_close(mapped, action)

@@ -157,7 +157,7 @@ def bench(monkeypatch):
 
 
 def test_runtime_from_measurement_to_bars(bench, tmp_path, capsys):
-    words = ["algo=SRad,DPre", "batch=2,16", "trials=2", "steps=3", "seeds=2", f"out={tmp_path}"]
+    words = ["algo=DPre,SRad", "batch=2,16", "trials=2", "steps=3", "seeds=2", f"out={tmp_path}"]
     assert bench.main(words) == 0
     printed = capsys.readouterr().out
     assert "first 3 gradient steps of each of 2 seeds in lockstep, mean of 2 trials" in printed
@@ -192,7 +192,7 @@ def test_an_interrupted_measurement_is_of_use(bench, tmp_path, capsys, monkeypat
             raise KeyboardInterrupt from None
 
     monkeypatch.setattr(bench, "measure", measure)
-    assert bench.main(["algo=DRad,DPro", "batch=1", "trials=2", f"out={tmp_path}"]) == 130
+    assert bench.main(["algo=DPro,DRad", "batch=1", "trials=2", f"out={tmp_path}"]) == 130
     captured = capsys.readouterr()
     assert "interrupted" in captured.err and "DPro" in captured.out and "2.50" in captured.out
     records = runtime.read_runtime(tmp_path / "runtime.csv")

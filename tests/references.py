@@ -50,6 +50,22 @@ class ReferenceSet:
         A point is the projection of x where x - point is in its normal cone, and maximises <g, .> where g is. A
         residual r leaves it within |r| of the true projection: it is that of x - r, and projections do not expand.
         """
+        return float(np.linalg.norm(self._normal_cone_remainder(point, outward, near)))
+
+    def oracle_gap(self, point: np.ndarray, gradient: np.ndarray, near: float = 1e-10) -> float:
+        """Bound on how much better than the feasible `point` another one may be for <gradient, .>.
+
+        The gradient is a normal plus a remainder, which gains at most its entries times the widths of the set.
+        """
+        widths = np.full(self.dim, 2.0)
+        if self.matrix is not None:
+            # An ellipse's half-width along an axis, if it is diagonal; else the box's.
+            diagonal = np.diag(self.matrix)
+            if np.array_equal(self.matrix, np.diag(diagonal)):
+                widths = 2.0 * np.minimum(1.0, np.sqrt(self.matrix_bound / np.maximum(diagonal, self.matrix_bound)))
+        return float(np.abs(self._normal_cone_remainder(point, gradient, near)) @ widths)
+
+    def _normal_cone_remainder(self, point: np.ndarray, outward: np.ndarray, near: float) -> np.ndarray:
         rows = np.vstack((self._unit_rows(), np.eye(self.dim), -np.eye(self.dim)))
         excess = np.concatenate((self._row_excess(point), point - 1.0, -point - 1.0))
         normals = rows[excess > -near]
@@ -58,8 +74,9 @@ class ReferenceSet:
             normals = np.vstack((normals, normal / np.linalg.norm(normal)))
         size = np.linalg.norm(outward)
         if len(normals) == 0 or size == 0.0:
-            return float(size)
-        return float(nnls(normals.T, outward / size)[1] * size)
+            return outward
+        share, _ = nnls(normals.T, outward / size)
+        return outward - size * (normals.T @ share)
 
     def chebyshev_radius(self) -> float:
         """Radius of the largest ball inside the linear rows and the box, by linear programming."""

@@ -621,3 +621,21 @@ def test_misuse():
 
     with pytest.raises(TypeError, match="Unwritten"):
         Intersection(Unwritten(2)).project(no_obs(1), NO_CENTER)
+
+
+@pytest.mark.parametrize("near_face", [1e-1, 1e-2, 1e-3, 1e-4])
+def test_projection_where_the_centre_of_an_ellipse_is_near_a_face(near_face):
+    """The start of the interior-point method is then near the boundary, where it may stall."""
+    generator = torch.Generator().manual_seed(2)
+    n = 500
+    spread = 10.0 ** (0.5 * torch.randn(n, 1, 1, generator=generator, dtype=torch.float64) + 0.5)
+    root = torch.randn(n, 2, 2, generator=generator, dtype=torch.float64) * spread
+    middle = torch.rand(n, 2, generator=generator, dtype=torch.float64) - 0.5
+    middle[:, 0] = 1.0 - near_face * torch.rand(n, generator=generator, dtype=torch.float64)
+    constraint = QuadraticConstraint(2, lambda obs: root.mT @ root, 1.0, lambda obs: middle)
+    target = 3.0 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    closest = constraint.project(no_obs(n), target)
+    # Closest means that no point of the set is further along what was cut off.
+    outward = torch.nn.functional.normalize(target - closest, dim=-1)
+    furthest = constraint.linear_oracle(no_obs(n), outward)
+    assert ((furthest - closest) * outward).sum(-1).max() <= 1e-10

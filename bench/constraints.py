@@ -22,7 +22,6 @@ from __future__ import annotations
 import csv
 import importlib.util
 import os
-import platform
 import sys
 import time
 from collections.abc import Callable
@@ -49,6 +48,7 @@ from constraints import (
     WeightedPositivePart,
 )
 from core.config import ConfigError, choose, split_names
+from core.results import processor
 from envs import TASKS
 from envs.reacher import Reacher
 
@@ -299,12 +299,7 @@ def active_share(task: str) -> float:
 
 
 def machine() -> str:
-    cpu = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-        cpu = models[0] if models else cpu
-    return f"{cpu}, torch {torch.__version__}, {torch.get_num_threads()} thread, float64"
+    return f"{processor()}, torch {torch.__version__}, {torch.get_num_threads()} thread, float64"
 
 
 def table(records: list[dict], batches: list[int]) -> str:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import csv
 import os
-import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -40,6 +39,7 @@ from core.agent import Agent
 from core.config import ConfigError, choose, split_names
 from core.random import stream_seed
 from core.replay import Replay
+from core.results import processor
 from plots.runtime import COLUMNS, runtime_table
 from plots.tables import to_terminal
 
@@ -115,13 +115,8 @@ def kernel_seconds(call: Callable[[], None]) -> float:
 
 def machine() -> str:
     """Processor, versions and device."""
-    cpu = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-        cpu = models[0] if models else cpu
     device = torch.cuda.get_device_name(DEVICE) if DEVICE.type == "cuda" else "no GPU"
-    return f"{cpu}, {device}, torch {torch.__version__}"
+    return f"{processor()}, {device}, torch {torch.__version__}"
 
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], list[int], dict[str, int], Path]:

@@ -106,12 +106,12 @@ def describe_environment(command: Sequence[str]) -> dict[str, Any]:
         # Absolute paths, alone or after `key=`, are cut to their last part.
         "command": shlex.join(re.sub(r"(^|=)/.*/(?=.)", r"\1", word) for word in command),
         "platform": platform.platform(),
-        "processor": _processor(),
+        "processor": processor(),
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
 
 
-def _processor() -> str:
+def processor() -> str:
     """The name of the CPU: float rounding depends on its instructions."""
     with suppress(OSError), open("/proc/cpuinfo") as file:
         for line in file:

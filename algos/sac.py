@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -19,11 +20,26 @@ from torch.optim import Optimizer
 from constraints import Constraint
 from core.agent import Agent, MapName, Placement
 from core.config import Config
-from core.networks import MLP, TwinCritic, adam, frozen_copy, rows_of, soft_update
+from core.networks import MLP, Adam, TwinCritic, frozen_copy, rows_of, soft_update
 from core.random import Streams
 from core.replay import Batch
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+
+
+class Sample(NamedTuple):
+    """Actions before any map, drawn from N(mean, diag std^2), each (seeds, batch, d)."""
+
+    raw: Tensor
+    mean: Tensor
+    std: Tensor
+    log_prob: Tensor  # (seeds, batch): of raw
+
+
+def normal_log_prob(residual: Tensor, log_std: Tensor) -> Tensor:
+    """Log-density (...) of independent normals (..., d), `residual` standard deviations from their means."""
+    constant = 0.5 * math.log(2 * math.pi) * log_std.shape[-1]
+    return -(log_std + 0.5 * residual.square()).sum(-1) - constant
 
 
 class GaussianActor(nn.Module):
@@ -35,14 +51,15 @@ class GaussianActor(nn.Module):
         self.noise_shape = (action_dim,)
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation (seeds, batch, d) of the action before any map."""
+        """Mean and log of the standard deviation (seeds, batch, d) of the action before any map."""
         mean, log_std = self.net(obs).chunk(2, dim=-1)
-        return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX).exp()
+        return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
 
-    def sample(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A reparametrised sample, with its mean and std; `noise` standard normal (seeds, batch, d)."""
-        mean, std = self(obs)
-        return mean + std * noise, mean, std
+    def sample(self, obs: Tensor, noise: Tensor) -> Sample:
+        """A reparametrised sample; `noise` standard normal (seeds, batch, d)."""
+        mean, log_std = self(obs)
+        std = log_std.exp()
+        return Sample(mean + std * noise, mean, std, normal_log_prob(noise, log_std))
 
 
 class StateDependentActor(nn.Module):
@@ -64,20 +81,17 @@ class StateDependentActor(nn.Module):
         self.noise_shape = (hidden[-1], action_dim)
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation (seeds, batch, d) of the action before any map."""
-        mean, std, _ = self._moments(obs)
-        return mean, std
-
-    def _moments(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean (seeds, batch, d) of the action before any map, and the latent features (seeds, batch, latent)."""
         latent = self.features(obs).relu()
-        mean = self.mean(latent).clamp(-self.MEAN_BOUND, self.MEAN_BOUND)
-        variance = latent.square() @ self.log_std.exp().square()
-        return mean, (variance + self.VARIANCE_FLOOR).sqrt(), latent
+        return self.mean(latent).clamp(-self.MEAN_BOUND, self.MEAN_BOUND), latent
 
-    def sample(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A reparametrised sample, with its mean and std; `noise` standard normal (seeds, latent, d)."""
-        mean, std, latent = self._moments(obs)
-        return mean + latent @ (self.log_std.exp() * noise), mean, std
+    def sample(self, obs: Tensor, noise: Tensor) -> Sample:
+        """A reparametrised sample; `noise` standard normal (seeds, latent, d)."""
+        mean, latent = self(obs)
+        theta_std = self.log_std.exp()
+        std = (latent.square() @ theta_std.square() + self.VARIANCE_FLOOR).sqrt()
+        deviation = latent @ (theta_std * noise)
+        return Sample(mean + deviation, mean, std, normal_log_prob(deviation / std, std.log()))
 
 
 class SAC(Agent):
@@ -100,9 +114,9 @@ class SAC(Agent):
         self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init)
         self.critic_target = frozen_copy(self.critic)
         self.temperature = Temperature(len(seeds))
-        self.actor_optimizer = adam(self.actor.parameters(), config.learning_rate)
-        self.critic_optimizer = adam(self.critic.parameters(), config.learning_rate)
-        self.temperature_optimizer = adam(self.temperature.parameters(), config.learning_rate)
+        self.actor_optimizer = Adam(self.actor.parameters(), config.learning_rate)
+        self.critic_optimizer = Adam(self.critic.parameters(), config.learning_rate)
+        self.temperature_optimizer = Adam(self.temperature.parameters(), config.learning_rate)
         self.target_entropy = -float(self.action_dim)
         self.unit_ball = config.entropy == "ball"
         self.rollout_noise = torch.zeros(len(seeds), *self.actor.noise_shape)
@@ -139,8 +153,7 @@ class SAC(Agent):
             noise = self.rollout_noise
         else:
             noise = self.exploration.normal(*self.actor.noise_shape, only=only).unsqueeze(1)
-        raw, _, _ = self.actor.sample(obs.unsqueeze(1), noise)
-        return self.suggest(raw.squeeze(1))
+        return self.suggest(self.actor.sample(obs.unsqueeze(1), noise).raw.squeeze(1))
 
     def suggest(self, raw: Tensor) -> Tensor:
         """The action before the map, in the box where a projection follows."""
@@ -158,19 +171,19 @@ class SAC(Agent):
 
     def sample(self, obs: Tensor, center: Tensor | None, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """An action as the critic sees it, its log-density (seeds, batch), and the suggestion before the map."""
-        raw, mean, std = self.actor.sample(obs, noise)
+        raw, mean, std, log_prob = self.actor.sample(obs, noise)
         if self.mapping == "alpha":
             ray = self.constraint.ray(obs, raw, center)
             log_prob = ray.alpha_log_prob(mean, std, self.unit_ball, self.config.boundary_weight)
             return ray.alpha_map(), log_prob, raw
-        normal = -0.5 * ((raw - mean) / std).square() - std.log() - 0.5 * math.log(2 * math.pi)
         if self.mapping == "radial":
             ray = self.constraint.ray(obs, raw, center)
-            log_prob = ray.radial_log_prob(normal.sum(-1), self.unit_ball, self.config.log_det_floor)
+            log_prob = ray.radial_log_prob(log_prob, self.unit_ball, self.config.log_det_floor)
             return ray.radial_map(), log_prob, raw
-        log_slope = 2 * (math.log(2) - raw - softplus(-2 * raw))  # of tanh, exact however far out
+        # log tanh' = 2 (log 2 - raw - softplus(-2 raw)), exact however far out.
+        log_slope = -2 * (raw + softplus(-2 * raw)).sum(-1) + 2 * math.log(2) * raw.shape[-1]
         suggested = self.suggest(raw)
-        return suggested, (normal - log_slope).sum(-1), suggested
+        return suggested, log_prob - log_slope, suggested
 
     def update(self, batch: Batch) -> None:
         """One step of temperature, critics and actor, in this order."""

@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from constraints import Constraint
 from core.agent import Agent, MapName, Placement
 from core.config import Config
-from core.networks import MLP, TwinCritic, adam, frozen_copy, rows_of, soft_update
+from core.networks import MLP, Adam, TwinCritic, frozen_copy, rows_of, soft_update
 from core.random import Streams
 from core.replay import Batch
 
@@ -39,8 +39,8 @@ class TD3(Agent):
         self.actor = MLP([obs_dim, *config.hidden, self.action_dim], init)
         self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init)
         self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
-        self.actor_optimizer = adam(self.actor.parameters(), config.learning_rate)
-        self.critic_optimizer = adam(self.critic.parameters(), config.learning_rate)
+        self.actor_optimizer = Adam(self.actor.parameters(), config.learning_rate)
+        self.critic_optimizer = Adam(self.critic.parameters(), config.learning_rate)
 
     def networks(self) -> dict[str, nn.Module]:
         return {

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import cached_property
 from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
-Network = TypeVar("Network", bound=nn.Module)
+Module = TypeVar("Module", bound=nn.Module)
 
 
 class Linear(nn.Module):
-    """Affine maps side by side, one a row: (rows, batch, inputs) -> (rows, batch, outputs).
-
-    An input of fewer rows goes through the first of them.
-    """
+    """The parameters of affine maps side by side, one a row: weight (rows, inputs, outputs), bias (rows, 1, outputs)."""
 
     def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]):
         super().__init__()
@@ -29,14 +27,17 @@ class Linear(nn.Module):
             bias[i].uniform_(-bound, bound, generator=generator)
         self.weight, self.bias = nn.Parameter(weight), nn.Parameter(bias)
 
-    def forward(self, x: Tensor) -> Tensor:
-        rows = x.shape[0]
-        if rows == self.weight.shape[0]:  # slicing would cost a copy of the gradient
-            return torch.baddbmm(self.bias, x, self.weight)
-        return torch.baddbmm(self.bias[:rows], x, self.weight[:rows])
+
+class Network(nn.Module):
+    """A module that has a target network: its parameters do not change their places."""
+
+    @cached_property
+    def parameter_list(self) -> list[nn.Parameter]:
+        """What `parameters()` yields; that walk through the modules takes longer than updating a target."""
+        return list(self.parameters())
 
 
-class MLP(nn.Module):
+class MLP(Network):
     """Fully connected network with ReLU between the layers: (rows, batch, sizes[0]) -> (rows, batch, sizes[-1])."""
 
     def __init__(self, sizes: Sequence[int], generators: Sequence[torch.Generator]):
@@ -46,12 +47,20 @@ class MLP(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        for layer in self.layers[:-1]:
-            x = layer(x).relu_()
-        return self.layers[-1](x)
+        """An input of fewer rows goes through the first of them."""
+        # On a small network Python and PyTorch's dispatch cost as much as the arithmetic, hence no calls of modules.
+        rows, last = x.shape[0], len(self.layers) - 1
+        for number, layer in enumerate(self.layers):
+            weight, bias = layer.weight, layer.bias
+            if rows < weight.shape[0]:
+                weight, bias = weight[:rows], bias[:rows]
+            x = torch.baddbmm(bias, x, weight)
+            if number < last:
+                x = x.relu_()
+        return x
 
 
-class TwinCritic(nn.Module):
+class TwinCritic(Network):
     """Two Q-functions a seed as one network of 2 * seeds rows: the first critics of all seeds, then the second."""
 
     def __init__(self, obs_dim: int, action_dim: int, hidden: Sequence[int], generators: Sequence[torch.Generator]):
@@ -61,33 +70,60 @@ class TwinCritic(nn.Module):
     def forward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Q-values (2, seeds, batch) of obs (seeds, batch, n) and action (seeds, batch, d)."""
         x = torch.cat([obs, action], dim=-1)
-        return self.net(x.repeat(2, 1, 1)).view(2, *x.shape[:2])
+        return self.net(x.expand(2, *x.shape).flatten(0, 1)).view(2, *x.shape[:2])
 
     def first(self, obs: Tensor, action: Tensor) -> Tensor:
         """Q-values (seeds, batch) of the first critic alone."""
         return self.net(torch.cat([obs, action], dim=-1)).squeeze(-1)
 
 
-def rows_of(module: Network, which: Sequence[int]) -> Network:
+def rows_of(module: Module, which: Sequence[int]) -> Module:
     """A frozen copy of `module` that has only the rows `which` of each parameter."""
     memo = {id(p): nn.Parameter(p.detach()[list(which)], requires_grad=False) for p in module.parameters()}
     return copy.deepcopy(module, memo)
 
 
-def frozen_copy(module: Network) -> Network:
+def frozen_copy(module: Module) -> Module:
     """A copy that no optimiser trains, for target networks."""
     return copy.deepcopy(module).requires_grad_(False)
 
 
 @torch.no_grad()
-def soft_update(target: nn.Module, source: nn.Module, tau: float) -> None:
+def soft_update(target: Network, source: Network, tau: float) -> None:
     """target <- (1 - tau) target + tau source, for all parameters at once."""
-    torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), tau)
+    torch._foreach_lerp_(target.parameter_list, source.parameter_list, tau)
 
 
-def adam(parameters, learning_rate: float) -> torch.optim.Adam:
-    """Adam with PyTorch's defaults; the fused kernel makes one pass over the memory."""
-    return torch.optim.Adam(parameters, lr=learning_rate, fused=True)
+class Adam(torch.optim.Adam):
+    """Adam with PyTorch's defaults; a step is one call of the fused kernel on lists made once.
+
+    PyTorch's own `step` gathers them anew each time, which takes longer than the kernel on networks of this size.
+    """
+
+    def __init__(self, parameters: Iterable[nn.Parameter], learning_rate: float):
+        super().__init__(parameters, lr=learning_rate, fused=True)
+        (group,) = self.param_groups
+        self.parameters: list[nn.Parameter] = group["params"]
+        self.count = torch.zeros((), device=self.parameters[0].device)
+        for parameter in self.parameters:
+            moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+            self.state[parameter] = {"step": self.count, **moments}
+        self.moments = [[self.state[p][name] for p in self.parameters] for name in ("exp_avg", "exp_avg_sq")]
+        self.constants = {
+            "lr": learning_rate, "beta1": group["betas"][0], "beta2": group["betas"][1], "eps": group["eps"],
+            "weight_decay": 0.0, "amsgrad": False, "maximize": False,
+        }  # fmt: skip
+
+    def _patch_step_function(self) -> None:
+        """PyTorch would wrap `step` into hooks for its profiler, which take longer than the step."""
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:
+        """One step along the parameters' `grad`."""
+        self.count += 1
+        gradients = [parameter.grad for parameter in self.parameters]
+        counts = [self.count] * len(gradients)
+        torch._fused_adam_(self.parameters, gradients, *self.moments, [], counts, **self.constants)
 
 
 def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:

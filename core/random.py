@@ -37,7 +37,8 @@ class Streams:
         return torch.stack(draws)
 
     def _fill(self, shape: tuple[int, ...], only: Iterable[int] | None, draw) -> Tensor:
-        out = torch.zeros(len(self.generators), *shape)
-        for i in range(len(self.generators)) if only is None else only:
+        everyone = only is None
+        out = (torch.empty if everyone else torch.zeros)(len(self.generators), *shape)
+        for i in range(len(self.generators)) if everyone else only:
             draw(out[i], self.generators[i])
         return out

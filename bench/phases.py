@@ -1,0 +1,135 @@
+"""Where the time of a training run goes, by phase.
+
+The run is the paper's protocol on HC+O, its first `STEPS` steps, made by `run.make_trainer`, with three differences:
+gradient steps begin after `WARM_UP` steps; TD3 takes them every 100 steps instead of once an episode of 1,000, as many
+in all; and the final evaluation has 5 episodes. Then each phase's time is scaled to a million steps of the protocol:
+gradient steps to the 9e5 after its own warm-up, evaluations to 5 episodes every 5,000 steps and 50 at the end (without
+the first one here, which makes its environments), checkpoints to one each 10,000 steps (those of this run, after its
+10,000 steps and at its end, count as one), everything else in proportion to the environment steps.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import algos.sac
+import algos.td3
+import run
+from bench.common import TASK
+from core.config import saved_settings
+from core.results import RunWriter
+
+STEPS, WARM_UP = 10_000, 9_500
+"""Environment steps of each seed, and those before the first gradient step."""
+PROTOCOL_STEPS = 1_000_000
+
+UPDATE = ("replay sampling", "forward and backward", "optimiser", "target update")
+OUTSIDE = ("exploration", "map", "environment", "storing", "evaluation", "checkpoint", "logging", "everything else")
+
+
+@dataclass(frozen=True)
+class Phases:
+    """Seconds of each phase, of all seeds together: as measured, and of a million steps a seed of the protocol."""
+
+    measured: dict[str, float]
+    scaled: dict[str, float]
+
+    def share(self, phase: str) -> float:
+        return self.scaled[phase] / sum(self.scaled.values())
+
+    @property
+    def share_outside(self) -> float:
+        """Of everything but sampling and gradient steps."""
+        return sum(map(self.share, OUTSIDE))
+
+
+class Stopwatch:
+    """Seconds of the calls of functions and methods, each call by itself."""
+
+    def __init__(self) -> None:
+        self.calls: dict[str, list[float]] = defaultdict(list)
+
+    def watch(self, owner: Any, name: str, phase: str) -> Any:
+        """A context in which the calls of `owner.name` count for `phase`."""
+        inner = getattr(owner, name)
+
+        def timed(*arguments, **options):
+            start = time.perf_counter()
+            try:
+                return inner(*arguments, **options)
+            finally:
+                self.calls[phase].append(time.perf_counter() - start)
+
+        return patch.object(owner, name, timed)
+
+    def seconds(self, phase: str) -> float:
+        return sum(self.calls[phase])
+
+
+@contextmanager
+def new_trainer(algo: str, seeds: Sequence[int], settings: Sequence[str], check: Callable[[], None]) -> Iterator:
+    """A trainer on the task as run.py makes it, without a progress bar, its folders deleted afterwards."""
+    ((config, _),) = run.plan([f"algo={algo}", f"env={TASK}", *settings])
+    with tempfile.TemporaryDirectory() as folder:
+        writers = [
+            RunWriter(Path(folder) / str(seed), saved_settings(config, seed), {}, config.eval_episodes)
+            for seed in seeds
+        ]
+        yield run.make_trainer(config, list(seeds), writers, progress=False, check=check)
+
+
+def measure_phases(algo: str, seeds: Sequence[int]) -> Phases:
+    """Train `seeds` in lockstep and time the phases, in wall-clock seconds."""
+    settings = [f"steps={STEPS}", f"learning_starts={WARM_UP}", f"checkpoint_every={STEPS}", "final_episodes=5"]
+    settings.append(f"eval_every={STEPS // 2}")
+    if algo.startswith("D"):
+        settings.append("train_freq=100")
+    watch = Stopwatch()
+    with new_trainer(algo, seeds, settings, check=lambda: None) as trainer, ExitStack() as watched:
+        agent = trainer.agent
+        watches = [
+            (trainer.replay, "sample", "replay sampling"),
+            (trainer.replay, "add", "storing"),
+            (agent, "update", "update"),
+            (agent, "explore", "exploration"),
+            (trainer.evaluator, "run", "evaluation"),
+            *((optimizer, "step", "optimiser") for optimizer in agent.optimizers().values()),
+            *((module, "soft_update", "target update") for module in (algos.td3, algos.sac)),
+            *(
+                (RunWriter, name, "logging")
+                for name in ("append_evaluation", "append_statistics", "save_parameters", "finish")
+            ),
+        ]
+        for owner, name, phase in watches:
+            watched.enter_context(watch.watch(owner, name, phase))
+        start = time.perf_counter()
+        results = trainer.run()
+        total = time.perf_counter() - start
+
+    measured = {phase: trainer.seconds[phase] for phase in ("environment", "map", "checkpoint")}
+    measured |= {phase: watch.seconds(phase) for phase in (*UPDATE, *OUTSIDE) if phase not in measured}
+    measured["forward and backward"] = sum(
+        sign * watch.seconds(phase) for phase, sign in (("update", 1), ("optimiser", -1), ("target update", -1))
+    )
+    measured["everything else"] = 0.0
+    measured["everything else"] = total - sum(measured.values())
+    return Phases(measured, _scaled(measured, watch.calls["evaluation"], results[0]["gradient_steps"], trainer.config))
+
+
+def _scaled(measured: dict[str, float], evaluations: list[float], gradient_steps: int, config) -> dict[str, float]:
+    learning_steps = PROTOCOL_STEPS - 100_000
+    factors = dict.fromkeys(measured, PROTOCOL_STEPS / STEPS)
+    factors |= dict.fromkeys(UPDATE, learning_steps / gradient_steps)
+    factors["exploration"] = learning_steps / (STEPS - WARM_UP)
+    scaled = {phase: factors[phase] * seconds for phase, seconds in measured.items()}
+    episodes = 5 * PROTOCOL_STEPS / 5_000 + 50
+    scaled["evaluation"] = episodes * sum(evaluations[1:]) / (5 * len(evaluations[1:]))
+    return {phase: scaled[phase] for phase in (*UPDATE, *OUTSIDE)}

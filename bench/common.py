@@ -50,8 +50,8 @@ def machine(device: torch.device) -> str:
 def make_agent(name: str, batch: int, seeds: Sequence[int]) -> Agent:
     """A new agent with the paper's settings for the task, the batch size apart."""
     ((config, _),) = run.plan([f"algo={name}", f"env={TASK}", f"batch_size={batch}"])
-    constraint = envs.constraint(TASK)
-    return ALGORITHMS[name].build(config, constraint, envs.TASKS[TASK].robot.obs_dim, seeds)
+    obs_dim = envs.make(TASK).observation_space.shape[0]
+    return ALGORITHMS[name].build(config, envs.constraint(TASK), obs_dim, seeds)
 
 
 def fill_replay(agent: Agent, transitions: int) -> Replay:

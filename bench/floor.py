@@ -77,9 +77,7 @@ class Pass:
         """Gradients of every layer's input, of the first one's only for the last `columns` (0: not at all)."""
         wanted = [columns, *self.widths[1:]]
         return [
-            Product(
-                self._g(i + 1), f"{self._w(i)}.T", self._g(i), self.rows, self.batch, self.widths[i + 1], wanted[i]
-            )
+            Product(self._g(i + 1), f"{self._w(i)}.T", self._g(i), self.rows, self.batch, self.widths[i + 1], wanted[i])
             for i in reversed(self._layers())
             if wanted[i]
         ]

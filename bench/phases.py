@@ -1,11 +1,14 @@
 """Where the time of a training run goes, by phase.
 
-The run is the paper's protocol on HC+O, its first `STEPS` steps, made by `run.make_trainer`, with three differences:
-gradient steps begin after `WARM_UP` steps; TD3 takes them every 100 steps instead of once an episode of 1,000, as many
-in all; and the final evaluation has 5 episodes. Then each phase's time is scaled to a million steps of the protocol:
-gradient steps to the 9e5 after its own warm-up, evaluations to 5 episodes every 5,000 steps and 50 at the end (without
-the first one here, which makes its environments), checkpoints to one each 10,000 steps (those of this run, after its
-10,000 steps and at its end, count as one), everything else in proportion to the environment steps.
+The run is made by `run.make_trainer`, with the paper's settings on HC+O, and is 10,000 steps long. Gradient steps begin
+after 9,500 of them; TD3 takes them every 100 steps instead of once an episode of 1,000, one for each step all the same.
+It has two evaluations, a final one that is no longer than these, and two checkpoints, of all its 10,000 transitions and
+at its end.
+
+Each phase's time is scaled to the protocol's million steps: gradient steps and exploration to the 9e5 steps after its
+own warm-up; evaluations to its number of episodes, without the first evaluation here, which makes the environments;
+logging to its number of evaluations; checkpoints to one each 10,000 steps, for which the two of this run count as one;
+everything else in proportion to the environment steps.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean
 from typing import Any
 from unittest.mock import patch
 
@@ -29,7 +33,8 @@ from core.results import RunWriter
 
 STEPS, WARM_UP = 10_000, 9_500
 """Environment steps of each seed, and those before the first gradient step."""
-PROTOCOL_STEPS = 1_000_000
+EPISODES = 5
+"""Of an evaluation."""
 
 UPDATE = ("replay sampling", "forward and backward", "optimiser", "target update")
 OUTSIDE = ("exploration", "map", "environment", "storing", "evaluation", "checkpoint", "logging", "everything else")
@@ -88,8 +93,8 @@ def new_trainer(algo: str, seeds: Sequence[int], settings: Sequence[str], check:
 
 def measure_phases(algo: str, seeds: Sequence[int]) -> Phases:
     """Train `seeds` in lockstep and time the phases, in wall-clock seconds."""
-    settings = [f"steps={STEPS}", f"learning_starts={WARM_UP}", f"checkpoint_every={STEPS}", "final_episodes=5"]
-    settings.append(f"eval_every={STEPS // 2}")
+    settings = [f"steps={STEPS}", f"learning_starts={WARM_UP}", f"checkpoint_every={STEPS}"]
+    settings += [f"eval_every={STEPS // 2}", f"eval_episodes={EPISODES}", f"final_episodes={EPISODES}"]
     if algo.startswith("D"):
         settings.append("train_freq=100")
     watch = Stopwatch()
@@ -121,15 +126,15 @@ def measure_phases(algo: str, seeds: Sequence[int]) -> Phases:
     )
     measured["everything else"] = 0.0
     measured["everything else"] = total - sum(measured.values())
-    return Phases(measured, _scaled(measured, watch.calls["evaluation"], results[0]["gradient_steps"], trainer.config))
-
-
-def _scaled(measured: dict[str, float], evaluations: list[float], gradient_steps: int, config) -> dict[str, float]:
-    learning_steps = PROTOCOL_STEPS - 100_000
-    factors = dict.fromkeys(measured, PROTOCOL_STEPS / STEPS)
-    factors |= dict.fromkeys(UPDATE, learning_steps / gradient_steps)
+    ((protocol, _),) = run.plan([f"algo={algo}", f"env={TASK}"])
+    learning_steps = protocol.steps - protocol.learning_starts
+    factors = dict.fromkeys(OUTSIDE, protocol.steps / STEPS)
+    factors |= dict.fromkeys(UPDATE, learning_steps / results[0]["gradient_steps"])
     factors["exploration"] = learning_steps / (STEPS - WARM_UP)
-    scaled = {phase: factors[phase] * seconds for phase, seconds in measured.items()}
-    episodes = 5 * PROTOCOL_STEPS / 5_000 + 50
-    scaled["evaluation"] = episodes * sum(evaluations[1:]) / (5 * len(evaluations[1:]))
-    return {phase: scaled[phase] for phase in (*UPDATE, *OUTSIDE)}
+    factors["checkpoint"] = protocol.steps / protocol.checkpoint_every
+    evaluations = protocol.steps / protocol.eval_every
+    factors["logging"] = evaluations / 2
+    scaled = {phase: factor * measured[phase] for phase, factor in factors.items()}
+    episodes = evaluations * protocol.eval_episodes + protocol.final_episodes
+    scaled["evaluation"] = episodes / EPISODES * mean(watch.calls["evaluation"][1:])
+    return Phases(measured, scaled)

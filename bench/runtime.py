@@ -67,10 +67,13 @@ def measure(name: str, batch: int, replay: Replay, seeds: Sequence[int], steps: 
 
 
 def kernel_seconds(call: Callable[[], None]) -> float:
+    torch.cuda.synchronize(DEVICE)
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         call()
         torch.cuda.synchronize(DEVICE)
-    return sum(event.self_device_time_total for event in profile.key_averages()) * 1e-6
+    # Events of the host may repeat the time of the kernels that they launch.
+    events = (event for event in profile.events() if event.device_type == torch.autograd.DeviceType.CUDA)
+    return sum(event.self_device_time_total for event in events) * 1e-6
 
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], list[int], dict[str, int], Path]:

@@ -21,16 +21,16 @@ and of Stable-Baselines3's `collect_rollouts`.
 At the first number of threads follows, for each number of seeds, where the wall-clock time of a whole run goes
 (bench/phases.py says how that is measured and scaled to the paper's million steps).
 
-Prints the tables and saves them in `out` (default bench/results) as training.csv and phases.csv.
+Prints the tables and saves them in `out` (default bench/results) as training and phases, .md and .csv.
 """
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -48,7 +48,7 @@ from bench.floor import Floor, update_products
 from bench.peer import INSTALLED, Peer, peer_version
 from bench.phases import OUTSIDE, UPDATE, Phases, measure_phases, new_trainer
 from core.config import Config, ConfigError, split_names
-from plots.tables import MISSING, Table, text_cells, to_terminal, write_csv
+from plots.tables import MISSING, Table, text_cells, to_terminal, write_csv, write_table
 
 ALGO = {"TD3": "DPre", "SAC": "SPre"}
 TRANSITIONS = 10_000
@@ -80,7 +80,7 @@ class Options:
     out: Path
 
 
-class _EnoughError(Exception):
+class _Enough(Exception):
     """Ends a training loop from within."""
 
 
@@ -104,7 +104,9 @@ def repeated(call: Callable[[], object], steps: int) -> Turn:
 
 def environment_turn(base: str, seeds: int, steps: int) -> Turn:
     """Environment steps of a new trainer's loop, without gradient steps; the first ten do not count."""
-    settings = ["learning_starts=0", f"train_freq={10**6}", f"buffer_size={TRANSITIONS}"]
+    never = 10**9
+    settings = [f"{key}={never}" for key in ("steps", "train_freq", "eval_every", "checkpoint_every")]
+    settings += ["learning_starts=0", f"buffer_size={TRANSITIONS}"]
 
     def turn(clock: Clock) -> float:
         times: list[float] = []
@@ -115,13 +117,11 @@ def environment_turn(base: str, seeds: int, steps: int) -> Turn:
                 times.append(clock())
             elif taken >= 10 + steps:
                 times.append(clock())
-                raise _EnoughError
+                raise _Enough
 
-        with new_trainer(ALGO[base], range(seeds), settings, check) as trainer:
-            try:
-                trainer.run()
-            except _EnoughError:
-                return times[1] - times[0]
+        with new_trainer(ALGO[base], range(seeds), settings, check) as trainer, suppress(_Enough):
+            trainer.run()
+        return times[1] - times[0]
 
     return turn
 
@@ -151,7 +151,7 @@ def measure(base: str, threads: int, options: Options, cells: dict[int, dict[str
     for number in range(options.rounds + 1):
         direction = 1 if number % 2 else -1
         for seeds in options.seeds[::direction]:
-            bar.set_description(f"{base}, {threads} threads, {seeds} seeds")
+            bar.set_description(f"{base}, threads={threads}, seeds={seeds}")
             for name, turn in list(cells[seeds].items())[::direction]:
                 steps = options.steps * (ENV_STEPS if "environment" in name else 1)
                 seconds = turn(clock) / (steps * (1 if "peer" in name else seeds))
@@ -213,7 +213,8 @@ def training_table(records: Sequence[dict]) -> Table:
         )
     first = records[0]
     title = f"{TASK}: milliseconds a step and seed, least (median) of {first['rounds']} rounds, on {first['machine']}"
-    header = ["", "seeds", "gradient step", "floor", "/ floor", "SB3", "SB3 /", "environment step", "SB3's", "SB3's /"]
+    header = ["", "seeds", "gradient step", "floor", "ours / floor", "SB3", "SB3 / ours"]
+    header += ["environment step", "SB3", "SB3 / ours"]
     return Table("training", title, header, 2, list(sections.values()), list(records))
 
 
@@ -235,31 +236,31 @@ def phase_records(base: str, seeds: int, threads: int, phases: Phases) -> list[d
 
 def phases_table(records: Sequence[dict]) -> Table:
     """Percent of a run's wall-clock time."""
-    columns = list(dict.fromkeys((r["base"], r["seeds"]) for r in records))
-    share = {(r["base"], r["seeds"], r["phase"]): r["share"] for r in records}
+    runs: dict[tuple, dict[str, dict]] = defaultdict(dict)
+    for record in records:
+        runs[record["base"], record["seeds"]][record["phase"]] = record
 
     def row(label: str, phases: Sequence[str]) -> list:
-        return text_cells(label, *(f"{100 * sum(share[*column, p] for p in phases):.2f}" for column in columns))
+        shares = (sum(phase_of[phase]["share"] for phase in phases) for phase_of in runs.values())
+        return text_cells(label, *(f"{100 * share:.2f}" for share in shares))
 
-    hours = {
-        column: sum(r["scaled_seconds"] for r in records if (r["base"], r["seeds"]) == column) / 3600
-        for column in columns
-    }
+    hours = (sum(record["scaled_seconds"] for record in phase_of.values()) / 3600 for phase_of in runs.values())
     sections = [
         [row(phase, [phase]) for phase in UPDATE],
         [row(phase, [phase]) for phase in OUTSIDE],
         [
             row("all outside sampling and update", OUTSIDE),
-            text_cells("hours of 1e6 steps of all seeds", *(f"{hours[column]:.2f}" for column in columns)),
+            text_cells("hours of 1e6 steps of all seeds", *(f"{total:.2f}" for total in hours)),
         ],
     ]
-    header = ["", *(f"{base}, {seeds} seed{'s' * (seeds > 1)}" for base, seeds in columns)]
-    title = f"{TASK}: percent of a run's wall-clock time, {records[0]['threads']} thread(s)"
+    header = ["", *(f"{base}, {seeds} seed{'s' * (seeds > 1)}" for base, seeds in runs)]
+    threads = records[0]["threads"]
+    title = f"{TASK}: percent of a run's wall-clock time, {threads} thread{'s' * (threads > 1)}"
     return Table("phases", title, header, 1, sections, list(records))
 
 
 def save(table: Table, folder: Path) -> None:
-    write_csv(folder / f"{table.name}.csv", table.records)
+    write_table(table, folder, ("csv", "md"))
     print(to_terminal(table, bold=False, width=None), flush=True)
 
 

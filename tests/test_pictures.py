@@ -173,7 +173,7 @@ def test_runtime_from_measurement_to_bars(bench, tmp_path, capsys):
 def test_the_replay_buffer_holds_real_steps(bench):
     for name in ("DPre", "DPro"):
         agent = bench.make_agent(name, 16, [3, 4])
-        batch = bench.fill_replay(agent).sample(64)
+        batch = bench.fill_replay(agent, 20).sample(64)
         assert agent.config.batch_size == 16 and batch.obs.shape == (2, 64, 17)
         step = batch.next_obs - batch.obs
         assert 1e-3 < step.abs().mean() < 10 and batch.reward.std() > 0 and batch.terminated.sum() == 0

@@ -1,0 +1,140 @@
+"""Where the time of a training run goes, by phase.
+
+The run is made by `run.make_trainer`, with the paper's settings on HC+O, and is 10,000 steps long. Gradient steps begin
+after 9,500 of them; TD3 takes them every 100 steps instead of once an episode of 1,000, one for each step all the same.
+It has two evaluations, a final one that is no longer than these, and two checkpoints, of all its 10,000 transitions and
+at its end.
+
+Each phase's time is scaled to the protocol's million steps: gradient steps and exploration to the 9e5 steps after its
+own warm-up; evaluations to its number of episodes, without the first evaluation here, which makes the environments;
+logging to its number of evaluations; checkpoints to one each 10,000 steps, for which the two of this run count as one;
+everything else in proportion to the environment steps.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean
+from typing import Any
+from unittest.mock import patch
+
+import algos.sac
+import algos.td3
+import run
+from bench.common import TASK
+from core.config import saved_settings
+from core.results import RunWriter
+
+STEPS, WARM_UP = 10_000, 9_500
+"""Environment steps of each seed, and those before the first gradient step."""
+EPISODES = 5
+"""Of an evaluation."""
+
+UPDATE = ("replay sampling", "forward and backward", "optimiser", "target update")
+OUTSIDE = ("exploration", "map", "environment", "storing", "evaluation", "checkpoint", "logging", "everything else")
+
+
+@dataclass(frozen=True)
+class Phases:
+    """Seconds of each phase, of all seeds together: as measured, and of a million steps a seed of the protocol."""
+
+    measured: dict[str, float]
+    scaled: dict[str, float]
+
+    def share(self, phase: str) -> float:
+        return self.scaled[phase] / sum(self.scaled.values())
+
+    @property
+    def share_outside(self) -> float:
+        """Of everything but sampling and gradient steps."""
+        return sum(map(self.share, OUTSIDE))
+
+
+class Stopwatch:
+    """Seconds of the calls of functions and methods, each call by itself."""
+
+    def __init__(self) -> None:
+        self.calls: dict[str, list[float]] = defaultdict(list)
+
+    def watch(self, owner: Any, name: str, phase: str) -> Any:
+        """A context in which the calls of `owner.name` count for `phase`."""
+        inner = getattr(owner, name)
+
+        def timed(*arguments, **options):
+            start = time.perf_counter()
+            try:
+                return inner(*arguments, **options)
+            finally:
+                self.calls[phase].append(time.perf_counter() - start)
+
+        return patch.object(owner, name, timed)
+
+    def seconds(self, phase: str) -> float:
+        return sum(self.calls[phase])
+
+
+@contextmanager
+def new_trainer(algo: str, seeds: Sequence[int], settings: Sequence[str], check: Callable[[], None]) -> Iterator:
+    """A trainer on the task as run.py makes it, without a progress bar, its folders deleted afterwards."""
+    ((config, _),) = run.plan([f"algo={algo}", f"env={TASK}", *settings])
+    with tempfile.TemporaryDirectory() as folder:
+        writers = [
+            RunWriter(Path(folder) / str(seed), saved_settings(config, seed), {}, config.eval_episodes)
+            for seed in seeds
+        ]
+        yield run.make_trainer(config, list(seeds), writers, progress=False, check=check)
+
+
+def measure_phases(algo: str, seeds: Sequence[int]) -> Phases:
+    """Train `seeds` in lockstep and time the phases, in wall-clock seconds."""
+    settings = [f"steps={STEPS}", f"learning_starts={WARM_UP}", f"checkpoint_every={STEPS}"]
+    settings += [f"eval_every={STEPS // 2}", f"eval_episodes={EPISODES}", f"final_episodes={EPISODES}"]
+    if algo.startswith("D"):
+        settings.append("train_freq=100")
+    watch = Stopwatch()
+    with new_trainer(algo, seeds, settings, check=lambda: None) as trainer, ExitStack() as watched:
+        agent = trainer.agent
+        watches = [
+            (trainer.replay, "sample", "replay sampling"),
+            (trainer.replay, "add", "storing"),
+            (agent, "update", "update"),
+            (agent, "explore", "exploration"),
+            (trainer.evaluator, "run", "evaluation"),
+            *((optimizer, "step", "optimiser") for optimizer in agent.optimizers().values()),
+            *((module, "soft_update", "target update") for module in (algos.td3, algos.sac)),
+            *(
+                (RunWriter, name, "logging")
+                for name in ("append_evaluation", "append_statistics", "save_parameters", "finish")
+            ),
+        ]
+        for owner, name, phase in watches:
+            watched.enter_context(watch.watch(owner, name, phase))
+        start = time.perf_counter()
+        results = trainer.run()
+        total = time.perf_counter() - start
+
+    measured = {phase: trainer.seconds[phase] for phase in ("environment", "map", "checkpoint")}
+    measured |= {phase: watch.seconds(phase) for phase in (*UPDATE, *OUTSIDE) if phase not in measured}
+    measured["forward and backward"] = sum(
+        sign * watch.seconds(phase) for phase, sign in (("update", 1), ("optimiser", -1), ("target update", -1))
+    )
+    measured["everything else"] = 0.0
+    measured["everything else"] = total - sum(measured.values())
+    ((protocol, _),) = run.plan([f"algo={algo}", f"env={TASK}"])
+    learning_steps = protocol.steps - protocol.learning_starts
+    factors = dict.fromkeys(OUTSIDE, protocol.steps / STEPS)
+    factors |= dict.fromkeys(UPDATE, learning_steps / results[0]["gradient_steps"])
+    factors["exploration"] = learning_steps / (STEPS - WARM_UP)
+    factors["checkpoint"] = protocol.steps / protocol.checkpoint_every
+    evaluations = protocol.steps / protocol.eval_every
+    factors["logging"] = evaluations / 2
+    scaled = {phase: factor * measured[phase] for phase, factor in factors.items()}
+    episodes = evaluations * protocol.eval_episodes + protocol.final_episodes
+    scaled["evaluation"] = episodes / EPISODES * mean(watch.calls["evaluation"][1:])
+    return Phases(measured, scaled)

@@ -17,6 +17,7 @@ from algos import ALGORITHMS, NFWPO
 from constraints import ConstraintError
 from core.checkpoint import Checkpoint, CheckpointFolder, choose
 from core.config import (
+    RUN_KEYS,
     Config,
     ConfigError,
     defaults,
@@ -85,8 +86,24 @@ def plan(arguments: list[str]) -> list[tuple[Config, Config]]:
             or getattr(base, key) is not None
             or all(getattr(other, key) is None for other in bases)
         }
-        cells.append((resolve(base, applicable), base))
+        config = resolve(base, applicable)
+        check_device(config.device)
+        cells.append((config, base))
     return cells
+
+
+def check_device(name: str) -> None:
+    """ConfigError where PyTorch cannot compute on the device `name`."""
+    choices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    choices += [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    if name not in choices:
+        hint = "" if len(choices) > 1 else "; PyTorch sees no CUDA GPU here"
+        raise ConfigError(f"bad value {name!r} for device{hint} (choices: {', '.join(choices)})")
+
+
+def device_name(device: str) -> str:
+    """What info.json calls it."""
+    return device if device == "cpu" else torch.cuda.get_device_name(device)
 
 
 def _paper_config(name: str, task: str) -> Config:
@@ -127,7 +144,7 @@ def make_trainer(
         )
         return Trainer(config, agent, train_envs, lambda: envs.make(config.env), writers, progress, check)
     except RuntimeError as error:
-        if "allocate memory" not in str(error):
+        if not any(words in str(error) for words in ("allocate memory", "out of memory")):
             raise
         raise ConfigError(
             f"not enough memory for {len(seeds)} seeds with hidden={config.hidden}, buffer_size={config.buffer_size}"
@@ -171,7 +188,10 @@ def train(config: Config, base: Config, check: Callable[[], None] = lambda: None
         for seed in sorted(ended):
             print(f"{folders[seed]}: {_end_of(folders[seed])} (overwrite=true starts it again and keeps this one)")
         groups, fresh = ([], list(folders)) if config.overwrite else _find_checkpoints(folders, ended)
-        info = describe_environment(["run.py", *sys.argv[1:]]) | {"threads": config.threads, "device": "cpu"}
+        info = describe_environment(["run.py", *sys.argv[1:]]) | {
+            "threads": config.threads,
+            "device": device_name(config.device),
+        }
         for group in groups:
             if ended.issuperset(group):  # the process died when all was done
                 for seed in group:
@@ -225,7 +245,7 @@ def _resume(
     writers = []
     for seed in seeds:
         checkpoint, settings = group[seed], saved_settings(config, seed)
-        for key in settings.keys() - {"threads", "checkpoint_every"}:
+        for key in settings.keys() - set(RUN_KEYS):
             if checkpoint.settings.get(key) != settings[key]:
                 raise ConfigError(
                     f"{folders[seed]} was started with {key}={checkpoint.settings.get(key)}, which is {settings[key]}"

@@ -110,17 +110,17 @@ class SAC(Agent):
         super().__init__(config, constraint, obs_dim, seeds, mapping=mapping, placement=placement)
         init = Streams(seeds, "init").generators
         actor_class = StateDependentActor if config.gsde else GaussianActor
-        self.actor = actor_class(obs_dim, self.action_dim, config.hidden, init)
-        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init)
+        self.actor = actor_class(obs_dim, self.action_dim, config.hidden, init).to(self.device)
+        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init).to(self.device)
         self.critic_target = frozen_copy(self.critic)
-        self.temperature = Temperature(len(seeds))
+        self.temperature = Temperature(len(seeds)).to(self.device)
         self.actor_optimizer = Adam(self.actor.parameters(), config.learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), config.learning_rate)
         self.temperature_optimizer = Adam(self.temperature.parameters(), config.learning_rate)
         self.target_entropy = -float(self.action_dim)
         self.unit_ball = config.entropy == "ball"
-        self.rollout_noise = torch.zeros(len(seeds), *self.actor.noise_shape)
-        self.entropy = torch.zeros(len(seeds), 1)  # of the policy at the last batch's states
+        self.rollout_noise = torch.zeros(len(seeds), *self.actor.noise_shape, device=self.device)
+        self.entropy = torch.zeros(len(seeds), 1, device=self.device)  # of the policy at the last batch's states
 
     def networks(self) -> dict[str, nn.Module]:
         return {
@@ -191,7 +191,7 @@ class SAC(Agent):
         action, log_prob, suggested = self.sample(batch.obs, batch.center, noise)
 
         alpha = self.temperature.log_alpha.detach().exp()
-        self.entropy = -log_prob.detach().mean(-1, keepdim=True)
+        self.entropy.copy_(-log_prob.detach().mean(-1, keepdim=True))
         surplus = self.target_entropy - self.entropy
         self.descend("temperature", -(self.temperature.log_alpha * surplus)[:, 0])
 

@@ -36,8 +36,8 @@ class TD3(Agent):
     ):
         super().__init__(config, constraint, obs_dim, seeds, mapping=mapping, placement=placement)
         init = Streams(seeds, "init").generators
-        self.actor = MLP([obs_dim, *config.hidden, self.action_dim], init)
-        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init)
+        self.actor = MLP([obs_dim, *config.hidden, self.action_dim], init).to(self.device)
+        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init).to(self.device)
         self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
         self.actor_optimizer = Adam(self.actor.parameters(), config.learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), config.learning_rate)
@@ -52,6 +52,10 @@ class TD3(Agent):
 
     def optimizers(self) -> dict[str, Optimizer]:
         return {"actor": self.actor_optimizer, "critic": self.critic_optimizer}
+
+    @property
+    def cycle(self) -> int:
+        return self.config.policy_delay
 
     def suggest(self, actor: MLP, obs: Tensor) -> Tensor:
         """mu(s): the action before the map, in the box where a projection follows."""

@@ -46,10 +46,11 @@ class Agent(ABC):
         self.config, self.constraint = config, constraint
         self.seeds, self.obs_dim, self.action_dim = seeds, obs_dim, constraint.dim
         self.mapping, self.placement = mapping, placement
-        self.exploration = Streams(seeds, "explore")
-        self.update_noise = Streams(seeds, "update")
+        self.device = torch.device(config.device)  # of networks, batches and what `explore` and `policy` are given
+        self.exploration = Streams(seeds, "explore", self.device)
+        self.update_noise = Streams(seeds, "update", self.device)
         self.updates = 0  # gradient steps so far, where an algorithm counts them
-        self.diverged: dict[int, str] = {}  # position of a seed -> what was not finite in a gradient step
+        self.losses: dict[str, Tensor] = {}  # (..., seeds) of the last step of each optimiser
 
     @property
     def bounded(self) -> bool:
@@ -113,19 +114,30 @@ class Agent(ABC):
         """What the last gradient step tells about the state of training: name -> (seeds,)."""
         return {}
 
+    @property
+    def cycle(self) -> int:
+        """After how many gradient steps the same kind of step comes again."""
+        return 1
+
     def descend(self, name: str, losses: Tensor) -> None:
-        """One step of the optimiser `name` on the sum of `losses` (..., seeds); `diverged` notes those not finite."""
-        loss = losses.sum()
-        descend(self.optimizers()[name], loss)
-        if not math.isfinite(loss.item()):
-            finite = losses.detach().isfinite().reshape(-1, len(self.seeds)).all(0)
-            for i in (~finite).nonzero().flatten().tolist():
-                self.diverged.setdefault(i, f"{name} loss")
+        """One step of the optimiser `name` on the sum of `losses` (..., seeds), which `diverged` looks at."""
+        self.losses[name] = losses.detach()
+        descend(self.optimizers()[name], losses.sum())
+
+    def diverged(self) -> dict[int, str]:
+        """The positions of the seeds with a loss that is not finite, and which. It waits for the device."""
+        found: dict[int, str] = {}
+        for name, losses in self.losses.items():
+            if not math.isfinite(losses.sum().item()):  # the common case costs little
+                finite = losses.isfinite().reshape(-1, len(self.seeds)).all(0)
+                for i in (~finite).nonzero().flatten().tolist():
+                    found.setdefault(i, f"{name} loss")
+        return found
 
     @torch.no_grad()
     def state(self, i: int) -> dict[str, Tensor]:
-        """A copy of the parameters of the seed in position i."""
-        return {name: self._rows(parameter)[:, i].clone() for name, parameter in self._parameters()}
+        """A copy of the parameters of the seed in position i, on the CPU."""
+        return {name: _copy(self._rows(parameter)[:, i]) for name, parameter in self._parameters()}
 
     @torch.no_grad()
     def load_state(self, i: int, state: dict[str, Tensor]) -> None:
@@ -135,18 +147,18 @@ class Agent(ABC):
 
     @torch.no_grad()
     def training_state(self, i: int) -> dict[str, Any]:
-        """A copy of all that the seed in position i needs to train on exactly as it would have."""
+        """A copy of all that the seed in position i needs to train on exactly as it would have, on the CPU."""
         optimizers = {}
         for name, optimizer in self.optimizers().items():
             for number, parameter in enumerate(_parameters_of(optimizer)):
                 for key, value in optimizer.state[parameter].items():
                     # Adam's moments have a row a seed, its step count is one for all.
                     rows = self._rows(value)[:, i] if value.dim() else value
-                    optimizers[f"{name}.{number}.{key}"] = rows.clone()
+                    optimizers[f"{name}.{number}.{key}"] = _copy(rows)
         return {
             "parameters": self.state(i),
             "optimizers": optimizers,
-            "memory": {name: tensor[i].clone() for name, tensor in self.memory().items()},
+            "memory": {name: _copy(tensor[i]) for name, tensor in self.memory().items()},
             "streams": {name: streams.generators[i].get_state() for name, streams in self._streams().items()},
             "updates": self.updates,
         }
@@ -159,10 +171,10 @@ class Agent(ABC):
             name, number, quantity = key.split(".")
             optimizer = self.optimizers()[name]
             parameter = _parameters_of(optimizer)[int(number)]
-            if quantity not in optimizer.state[parameter]:
-                optimizer.state[parameter][quantity] = torch.zeros_like(parameter) if saved.dim() else saved.clone()
-            if saved.dim():
-                self._rows(optimizer.state[parameter][quantity])[:, i] = saved
+            if quantity not in optimizer.state[parameter]:  # PyTorch's own optimisers make them in their first step
+                optimizer.state[parameter][quantity] = torch.zeros_like(parameter if saved.dim() else saved)
+            value = optimizer.state[parameter][quantity]
+            (self._rows(value)[:, i] if saved.dim() else value).copy_(saved)
         for name, tensor in self.memory().items():
             tensor[i] = state["memory"][name]
         for name, streams in self._streams().items():
@@ -203,3 +215,8 @@ class Agent(ABC):
 
 def _parameters_of(optimizer: Optimizer) -> list[nn.Parameter]:
     return [parameter for group in optimizer.param_groups for parameter in group["params"]]
+
+
+def _copy(tensor: Tensor) -> Tensor:
+    """A copy on the CPU."""
+    return torch.empty_like(tensor, device="cpu", memory_format=torch.contiguous_format).copy_(tensor)

@@ -68,7 +68,9 @@ class Checkpoint:
             with open(self.path.parent / name, "rb") as file:
                 file.seek((kept - start) * sum(replay.widths) * 4)
                 for rows in replay.stretch(i, kept, stop):
-                    file.readinto(rows.numpy().data.cast("B"))
+                    read = torch.empty_like(rows, device="cpu")
+                    file.readinto(read.numpy().data.cast("B"))
+                    rows.copy_(read)
 
 
 class CheckpointFolder:
@@ -127,7 +129,7 @@ class CheckpointFolder:
         start = max(oldest, files[-1].stop if files else 0)
         if start < stop:
             name, digest = f"replay-{start}-{stop}.f32", hashlib.sha256()
-            stretch = [rows.numpy().data.cast("B") for rows in replay.stretch(i, start, stop)]
+            stretch = [rows.cpu().numpy().data.cast("B") for rows in replay.stretch(i, start, stop)]
             for rows in stretch:
                 digest.update(rows)
             replace_file(self.folder / name, lambda file: file.writelines(stretch))

@@ -60,11 +60,15 @@ class Config:
     # The run itself; none of these changes what is learned, beyond float rounding.
     results: str = field(default="results", metadata={"help": "folder that results go to"})
     overwrite: bool = field(default=False, metadata={"help": "start again in any case; the old run is kept"})
+    device: str = field(
+        default="cpu",
+        metadata={"help": "of networks and replay buffer: cpu, cuda or cuda:1"},
+    )
     threads: int = field(default=1, metadata={"help": "CPU threads of PyTorch"})
     checkpoint_every: int = field(default=10_000, metadata={"help": "environment steps of a seed between checkpoints"})
 
 
-RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "threads", "checkpoint_every")
+RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "device", "threads", "checkpoint_every")
 """Settings that do not make a run another experiment: they never show in a run's name."""
 
 TD3_CONSTANTS = {"policy_delay": 2, "target_noise": 0.2, "target_noise_clip": 0.5}

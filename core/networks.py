@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class Linear(nn.Module):
-    """The parameters of affine maps side by side, one a row: weight (rows, inputs, outputs), bias (rows, 1, outputs)."""
+    """Parameters of affine maps side by side, one a row: weight (rows, inputs, outputs) and bias (rows, 1, outputs)."""
 
     def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]):
         super().__init__()
@@ -32,9 +32,9 @@ class Network(nn.Module):
     """A module that has a target network: its parameters do not change their places."""
 
     @cached_property
-    def parameter_list(self) -> list[nn.Parameter]:
+    def parameter_list(self) -> list[Tensor]:
         """What `parameters()` yields; that walk through the modules takes longer than updating a target."""
-        return list(self.parameters())
+        return [*self.parameters()]
 
 
 class MLP(Network):
@@ -50,8 +50,9 @@ class MLP(Network):
         """An input of fewer rows goes through the first of them."""
         # On a small network Python and PyTorch's dispatch cost as much as the arithmetic, hence no calls of modules.
         rows, last = x.shape[0], len(self.layers) - 1
-        for number, layer in enumerate(self.layers):
-            weight, bias = layer.weight, layer.bias
+        for number, layer in enumerate(cast("Iterable[Linear]", self.layers)):
+            weight: Tensor = layer.weight
+            bias: Tensor = layer.bias
             if rows < weight.shape[0]:
                 weight, bias = weight[:rows], bias[:rows]
             x = torch.baddbmm(bias, x, weight)
@@ -102,28 +103,42 @@ class Adam(torch.optim.Adam):
 
     def __init__(self, parameters: Iterable[nn.Parameter], learning_rate: float):
         super().__init__(parameters, lr=learning_rate, fused=True)
-        (group,) = self.param_groups
-        self.parameters: list[nn.Parameter] = group["params"]
+        self.parameters: list[Tensor] = [*self.param_groups[0]["params"]]
         self.count = torch.zeros((), device=self.parameters[0].device)
         for parameter in self.parameters:
             moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
             self.state[parameter] = {"step": self.count, **moments}
-        self.moments = [[self.state[p][name] for p in self.parameters] for name in ("exp_avg", "exp_avg_sq")]
-        self.constants = {
-            "lr": learning_rate, "beta1": group["betas"][0], "beta2": group["betas"][1], "eps": group["eps"],
-            "weight_decay": 0.0, "amsgrad": False, "maximize": False,
-        }  # fmt: skip
+
+    @cached_property
+    def moments(self) -> list[list[Tensor]]:
+        """First and second moments of all parameters."""
+        return [[self.state[parameter][name] for parameter in self.parameters] for name in ("exp_avg", "exp_avg_sq")]
 
     def _patch_step_function(self) -> None:
         """PyTorch would wrap `step` into hooks for its profiler, which take longer than the step."""
 
     @torch.no_grad()
-    def step(self, closure: None = None) -> None:
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
         """One step along the parameters' `grad`."""
         self.count += 1
-        gradients = [parameter.grad for parameter in self.parameters]
-        counts = [self.count] * len(gradients)
-        torch._fused_adam_(self.parameters, gradients, *self.moments, [], counts, **self.constants)
+        (group,) = self.param_groups
+        beta1, beta2 = group["betas"]
+        exp_avgs, exp_avg_sqs = self.moments
+        torch._fused_adam_(
+            self.parameters,
+            [parameter.grad for parameter in self.parameters],
+            exp_avgs,
+            exp_avg_sqs,
+            [],
+            [self.count] * len(self.parameters),
+            lr=group["lr"],
+            beta1=beta1,
+            beta2=beta2,
+            weight_decay=0.0,
+            eps=group["eps"],
+            amsgrad=False,
+            maximize=False,
+        )
 
 
 def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:

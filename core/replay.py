@@ -26,20 +26,31 @@ class Batch(NamedTuple):
 class Replay:
     """A ring of `capacity` transitions for each seed."""
 
-    def __init__(self, seeds: Sequence[int], capacity: int, obs_dim: int, action_dim: int, centers: bool):
+    def __init__(
+        self,
+        seeds: Sequence[int],
+        capacity: int,
+        obs_dim: int,
+        action_dim: int,
+        centers: bool,
+        device: torch.device | str = "cpu",
+    ):
         self.capacity = capacity
+        # The next observation is stored beside its own, although it comes again in the next row (but at an episode's
+        # end): a transition is one stretch of memory, and memory's latency is what sampling costs.
         self.widths = [obs_dim, action_dim, 1, 1, obs_dim] + [action_dim] * (2 if centers else 0)
-        self.rows = torch.empty(len(seeds) * capacity, sum(self.widths))
-        self.offsets = torch.arange(len(seeds)).unsqueeze(1) * capacity
+        self.rows = torch.empty(len(seeds) * capacity, sum(self.widths), device=device)
+        self.offsets = torch.arange(len(seeds), device=device).unsqueeze(1) * capacity
         self.rows[self.offsets] = 0.0  # what a seed without transitions samples: one that failed at its first step
         self.added = [0] * len(seeds)
-        self.streams = Streams(seeds, "replay")
+        self.streams = Streams(seeds, "replay", device)
 
     def add(self, which: Sequence[int], *columns: Tensor) -> None:
         """Append one transition to each seed of `which`; `columns` (seeds, features) in the order of `Batch`."""
-        rows = torch.cat(columns, dim=-1)
+        places = [i * self.capacity + self.added[i] % self.capacity for i in which]
+        rows = torch.cat(columns, dim=-1)[list(which)]
+        self.rows.index_copy_(0, torch.tensor(places).to(self.rows.device), rows.to(self.rows.device))
         for i in which:
-            self.rows[i * self.capacity + self.added[i] % self.capacity] = rows[i]
             self.added[i] += 1
 
     def stretch(self, i: int, start: int, stop: int) -> list[Tensor]:
@@ -53,8 +64,11 @@ class Replay:
 
     def sample(self, batch_size: int) -> Batch:
         """`batch_size` transitions of every seed, uniform with replacement."""
-        sizes = [min(max(n, 1), self.capacity) for n in self.added]
-        indices = self.streams.indices(sizes, batch_size) + self.offsets
+        indices = self.streams.deliver(lambda: self.streams.indices(self._sizes(), batch_size)) + self.offsets
         rows = self.rows.index_select(0, indices.flatten()).view(*indices.shape, -1)
         obs, action, reward, terminated, next_obs, *centers = rows.split(self.widths, dim=-1)
         return Batch(obs, action, reward[..., 0], terminated[..., 0], next_obs, *(centers or (None, None)))
+
+    def _sizes(self) -> list[int]:
+        """Transitions that each seed can sample."""
+        return [min(max(n, 1), self.capacity) for n in self.added]

@@ -23,6 +23,7 @@ from core.agent import Agent
 from core.checkpoint import Checkpoint, CheckpointFolder
 from core.config import Config
 from core.evaluation import Evaluator
+from core.graph import GradientSteps
 from core.interrupt import Interrupted
 from core.random import stream_seed
 from core.replay import Replay
@@ -58,7 +59,9 @@ class Trainer:
             agent.obs_dim,
             agent.action_dim,
             agent.stores_centers,
+            agent.device,
         )
+        self.take_gradient_step = GradientSteps(agent, self.replay, config.batch_size)
         count = len(self.seeds)
         # Each seed's counters:
         self.steps = [0] * count
@@ -150,15 +153,16 @@ class Trainer:
     def _update(self, live: Sequence[int]) -> None:
         """One gradient step: all seeds that have not ended owe some."""
         with self._timed("update"):
-            self.agent.update(self.replay.sample(self.config.batch_size))
+            self.take_gradient_step()
         for i in live:
             self.owed[i] -= 1
             self.gradient_steps[i] += 1
             if not self.owed[i]:
                 self.agent.start_rollout([i])
-        for i, quantity in self.agent.diverged.items():
-            self._fail(i, f"{quantity} is not finite")
-        self.agent.diverged.clear()
+        # To ask a GPU is to wait for it; what is not finite stays so.
+        if self.agent.device.type == "cpu" or not all(self.owed[i] for i in live):
+            for i, quantity in self.agent.diverged().items():
+                self._fail(i, f"{quantity} is not finite")
 
     def _step(self, which: Sequence[int]) -> None:
         """One environment step of the seeds `which`."""
@@ -209,9 +213,9 @@ class Trainer:
         trained = [i for i in which if self.steps[i] >= self.config.learning_starts]
         suggested = torch.zeros(len(self.seeds), self.agent.action_dim)
         if warm:
-            suggested[warm] = self.agent.warm_up(warm)[warm]
+            suggested[warm] = self.agent.warm_up(warm)[warm].cpu()
         if trained:
-            suggested[trained] = self.agent.explore(self.obs, trained)[trained]
+            suggested[trained] = self.agent.explore(self.obs.to(self.agent.device), trained)[trained].cpu()
         with self._timed("map"):
             if trained:
                 executed = self.agent.feasible(self.obs, suggested, self.center)
@@ -251,7 +255,7 @@ class Trainer:
         if not which:
             return
         with self._timed("evaluation"):
-            returns = self.evaluator.run(self.agent.policy(which), which, self.config.eval_episodes)
+            returns = self.evaluator.run(self._policy(which), which, self.config.eval_episodes)
         statistics = self.agent.statistics()
         for i, seed_returns in zip(which, returns, strict=True):
             if i in self.evaluator.refused:
@@ -269,13 +273,18 @@ class Trainer:
                 self.writers[i].save_parameters("best", self.best[i][2])
         self.progress.show_evaluation(float(returns.mean()), [best[0] for best in self.best if best])
 
+    def _policy(self, which: Sequence[int]) -> Callable[[torch.Tensor], torch.Tensor]:
+        """The present deterministic policy of the seeds `which`, from and to the CPU."""
+        policy = self.agent.policy(which)
+        return lambda obs: policy(obs.to(self.agent.device)).cpu()
+
     def _finish(self, which: Sequence[int]) -> None:
         """Save the last parameters and evaluate the best ones at length, for the result."""
         last = {i: self.agent.state(i) for i in which}
         try:
             for i in which:
                 self.agent.load_state(i, self.best[i][2])
-            policy = self.agent.policy(which)  # a copy of the best parameters
+            policy = self._policy(which)  # a copy of the best parameters
         finally:
             for i in which:
                 self.agent.load_state(i, last[i])

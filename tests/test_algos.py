@@ -352,7 +352,7 @@ def test_choices_of_entropy_change_the_density_and_nothing_else(name, settings, 
     action, log_prob, suggested = agent.sample(batch.obs, batch.center, noise)
     assert torch.equal(action, plain[0]) and torch.equal(suggested, plain[2])
     ray = CONSTRAINT.ray(batch.obs, suggested, batch.center)
-    mean, std = agent.actor(batch.obs)
+    mean, std = agent.actor.sample(batch.obs, noise)[1:3]
     if name == "SRad":
         expected = ray.radial_log_prob(Normal(mean, std).log_prob(suggested).sum(-1), **options)
     else:
@@ -374,9 +374,10 @@ def test_the_variance_of_gsde_is_that_of_its_noise():
     with torch.no_grad():
         actor.log_std.copy_(torch.randn(actor.log_std.shape, generator=generator))
         obs = 3 * torch.randn(1, 4, OBS, generator=generator)
-        samples, mean, std = actor.sample(obs, torch.randn(40_000, 6, DIM, generator=generator))
+        samples, mean, std, log_prob = actor.sample(obs, torch.randn(40_000, 6, DIM, generator=generator))
         latent = mlp(actor.features, 0, obs[0]).relu()
     assert samples.shape == (40_000, 4, DIM)
+    torch.testing.assert_close(log_prob, Normal(mean, std).log_prob(samples).sum(-1))
     torch.testing.assert_close(samples.var(0), std[0] ** 2, rtol=0.05, atol=0)
     torch.testing.assert_close((samples - mean).mean(0) / std[0], torch.zeros(4, DIM), rtol=0, atol=0.03)
     variance = (latent[:, :, None] ** 2 * actor.log_std[0].exp() ** 2).sum(1)

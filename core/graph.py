@@ -1,0 +1,117 @@
+"""Gradient steps as CUDA graphs: the hundreds of kernels of a step are launched at once, without Python in between.
+
+A graph repeats its operations on the same memory. What differs from step to step are the random numbers: they are drawn
+on the CPU, from each seed's own streams, just as without a GPU, and copied to where the graph reads them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from core.agent import Agent
+from core.replay import Replay
+
+EAGER_STEPS = 3
+"""Steps of each kind taken before one is captured: libraries allocate what they need when first called."""
+
+
+class Tape:
+    """The draws of one gradient step in their order, each with the tensor on the device that holds its numbers.
+
+    First it records; after `rewind` it hands out the same tensors again, in the same order, and draws nothing.
+    """
+
+    def __init__(self) -> None:
+        self.entries: list[tuple[Callable[[], Tensor], Tensor]] = []
+        self.position: int | None = None
+
+    def deliver(self, draw: Callable[[], Tensor], device: torch.device) -> Tensor:
+        """The numbers of `draw()` on the `device`."""
+        if self.position is None:
+            self.entries.append((draw, draw().to(device)))
+            return self.entries[-1][1]
+        self.position += 1
+        return self.entries[self.position - 1][1]
+
+    def rewind(self) -> None:
+        self.position = 0
+
+    def draw_again(self) -> None:
+        """New numbers from the streams, into the same tensors; the device is not waited for."""
+        for draw, numbers in self.entries:
+            numbers.copy_(draw(), non_blocking=True)
+
+
+class CapturedStep:
+    """A gradient step of `agent`, captured but not taken, that can be repeated; `tape` is of an earlier one."""
+
+    def __init__(self, agent: Agent, step: Callable[[], None], tape: Tape):
+        self.agent, self.tape = agent, tape
+        self.graph = torch.cuda.CUDAGraph()
+        updates = agent.updates
+        tape.rewind()
+        with torch.cuda.graph(self.graph):
+            step()
+        self.counted, agent.updates = agent.updates - updates, updates
+        self.losses = dict(agent.losses)  # in the graph's memory: each repetition fills them
+
+    def repeat(self) -> None:
+        self.tape.draw_again()
+        self.graph.replay()
+        self.agent.updates += self.counted
+        self.agent.losses = self.losses
+
+
+class GradientSteps:
+    """Calling it takes one gradient step of every seed of `agent`, on a batch from `replay`.
+
+    On a GPU the first steps of each of the agent's kinds are taken one operation after the other, later ones as graphs,
+    and no call waits for the GPU.
+    """
+
+    def __init__(self, agent: Agent, replay: Replay, batch_size: int):
+        self.agent, self.replay, self.batch_size = agent, replay, batch_size
+        self.eager = [0] * agent.cycle  # steps of each kind
+        self.tapes: dict[int, Tape] = {}
+        self.captured: dict[int, CapturedStep] = {}
+
+    def __call__(self) -> None:
+        if self.agent.device.type != "cuda":
+            self._step()
+            return
+        kind = self.agent.updates % self.agent.cycle
+        if self.eager[kind] < EAGER_STEPS:
+            self._step_aside(kind)
+            self.eager[kind] += 1
+            return
+        if kind not in self.captured:
+            with self._using(self.tapes[kind]):
+                self.captured[kind] = CapturedStep(self.agent, self._step, self.tapes[kind])
+        self.captured[kind].repeat()
+
+    def _step(self) -> None:
+        self.agent.update(self.replay.sample(self.batch_size))
+
+    def _step_aside(self, kind: int) -> None:
+        """An eager step on a stream of its own, as capturing asks for; its draws are recorded."""
+        self.tapes[kind] = Tape()
+        stream = torch.cuda.Stream(self.agent.device)
+        stream.wait_stream(torch.cuda.current_stream(self.agent.device))
+        with torch.cuda.stream(stream), self._using(self.tapes[kind]):
+            self._step()
+        torch.cuda.current_stream(self.agent.device).wait_stream(stream)
+
+    @contextmanager
+    def _using(self, tape: Tape) -> Iterator[None]:
+        streams = (self.agent.update_noise, self.replay.streams)
+        for each in streams:
+            each.tape = tape
+        try:
+            yield
+        finally:
+            for each in streams:
+                each.tape = None

@@ -172,6 +172,8 @@ def train(config: Config, base: Config, check: Callable[[], None] = lambda: None
     """Run the seeds of one cell that have not ended, from their checkpoints where there are any, and say what came out
     and where it is. Whether all seeds have a result."""
     torch.set_num_threads(config.threads)
+    if config.device.startswith("cuda:"):
+        torch.cuda.set_device(config.device)
     check_constraint(config.env)
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     if config.steps <= config.learning_starts:

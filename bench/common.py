@@ -47,9 +47,9 @@ def machine(device: torch.device) -> str:
     return f"{processor()}, {name}, torch {torch.__version__}"
 
 
-def make_agent(name: str, batch: int, seeds: Sequence[int]) -> Agent:
+def make_agent(name: str, batch: int, seeds: Sequence[int], device: torch.device | str = "cpu") -> Agent:
     """A new agent with the paper's settings for the task, the batch size apart."""
-    ((config, _),) = run.plan([f"algo={name}", f"env={TASK}", f"batch_size={batch}"])
+    ((config, _),) = run.plan([f"algo={name}", f"env={TASK}", f"batch_size={batch}", f"device={device}"])
     obs_dim = envs.make(TASK).observation_space.shape[0]
     return ALGORITHMS[name].build(config, envs.constraint(TASK), obs_dim, seeds)
 
@@ -58,11 +58,11 @@ def fill_replay(agent: Agent, transitions: int) -> Replay:
     """A buffer with as many steps of the environment of each of the agent's seeds, under its warm-up actions."""
     seeds = agent.seeds
     everyone = range(len(seeds))
-    replay = Replay(seeds, transitions, agent.obs_dim, agent.action_dim, agent.stores_centers)
+    replay = Replay(seeds, transitions, agent.obs_dim, agent.action_dim, agent.stores_centers, agent.device)
     robots = [envs.make(TASK) for _ in seeds]
     obs = stack([env.reset(seed=stream_seed(seed, "environment"))[0] for env, seed in zip(robots, seeds, strict=True)])
     for _ in range(transitions):
-        suggested = agent.warm_up(everyone)
+        suggested = agent.warm_up(everyone).cpu()
         executed = agent.pull_back(obs, suggested, None)
         steps = [env.step(action) for env, action in zip(robots, executed.numpy(), strict=True)]
         next_obs, reward, terminated = (stack([step[k] for step in steps]) for k in range(3))

@@ -1,0 +1,202 @@
+"""Gradient steps on a GPU: captured once and repeated, with every seed's own random numbers, and never waited for.
+
+Without a GPU, a stand-in for CUDA's graphs calls the captured operations again when they are to be repeated, and
+PyTorch's meta device shows that a step asks nothing of its device.
+"""
+
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+import torch
+
+import core.graph
+import envs
+import run
+from algos import ALGORITHMS
+from core.graph import EAGER_STEPS, GradientSteps, Tape
+from core.replay import Replay
+
+SEEDS = [3, 8]
+BATCH = 16
+STEPS = 12
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+
+
+def make(name, task="W+M", device="cpu"):
+    """An agent with small networks and a replay buffer with random transitions that keeps growing."""
+    ((config, _),) = run.plan([f"algo={name}", f"env={task}", "hidden=[16,16]", f"batch_size={BATCH}"])
+    constraint, robot = envs.constraint(task), envs.TASKS[task].robot
+    agent = ALGORITHMS[name].build(replace(config, device=device), constraint, robot.obs_dim, SEEDS)
+    replay = Replay(SEEDS, 60, agent.obs_dim, agent.action_dim, agent.stores_centers, agent.device)
+    generator = torch.Generator().manual_seed(0)
+
+    def grow(count):
+        for _ in range(count):
+            obs, next_obs = (torch.randn(2, agent.obs_dim, generator=generator) for _ in range(2))
+            action = agent.pull_back(obs, torch.rand(2, agent.action_dim, generator=generator) * 2 - 1, None)
+            columns = [obs, action, torch.randn(2, 1, generator=generator), torch.zeros(2, 1), next_obs]
+            if agent.stores_centers:
+                columns += [constraint.center(obs), constraint.center(next_obs)]
+            replay.add([0, 1], *columns)
+
+    grow(20)
+    return agent, replay, grow
+
+
+def train(agent, replay, grow):
+    """Gradient steps while the buffer grows and wraps."""
+    step = GradientSteps(agent, replay, BATCH)
+    for _ in range(STEPS):
+        step()
+        grow(5)
+    return step
+
+
+def outcome(agent):
+    return [agent.training_state(i) for i in range(len(SEEDS))]
+
+
+class FakeGraph:
+    """Repeats by calling what was captured; `capturing` must not take a step, so it is undone."""
+
+    made = 0
+
+    def __init__(self):
+        FakeGraph.made += 1
+        self.call = None
+
+    def replay(self):
+        self.call()
+
+
+@pytest.fixture
+def cuda_stand_in(monkeypatch):
+    """Makes GradientSteps treat the CPU as a GPU."""
+    FakeGraph.made = 0
+
+    class Device:
+        type = "cuda"
+
+    class Captured(core.graph.CapturedStep):
+        def __init__(self, agent, step, tape):
+            def again():
+                tape.rewind()
+                updates, streams = agent.updates, (agent.update_noise, steps_of[0].replay.streams)
+                for each in streams:
+                    each.tape = tape
+                step()
+                for each in streams:
+                    each.tape = None
+                agent.updates = updates  # a graph's Python code does not run again
+
+            @contextmanager
+            def capture(graph):
+                before = outcome(agent)
+                yield
+                for i, state in enumerate(before):
+                    updates = agent.updates
+                    agent.load_training_state(i, state)
+                    agent.updates = updates
+                graph.call = again
+
+            monkeypatch.setattr(torch.cuda, "graph", capture)
+            super().__init__(agent, step, tape)
+
+    steps_of = []
+
+    class Steps(GradientSteps):
+        def __init__(self, agent, replay, batch_size):
+            super().__init__(agent, replay, batch_size)
+            steps_of[:] = [self]
+
+        def __call__(self):
+            device, self.agent.device = self.agent.device, Device()
+            try:
+                super().__call__()
+            finally:
+                self.agent.device = device
+
+        def _step_aside(self, kind):
+            self.tapes[kind] = Tape()
+            with self._using(self.tapes[kind]):
+                self._step()
+
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", FakeGraph)
+    monkeypatch.setattr(core.graph, "CapturedStep", Captured)
+    return Steps
+
+
+@pytest.mark.parametrize("name", ["DPre+", "DRad", "NFW", "SPre", "SAlpha"])
+def test_repeated_steps_draw_the_numbers_of_eager_ones(name, cuda_stand_in, monkeypatch):
+    eager, repeated = make(name), make(name)
+    train(*eager)
+    monkeypatch.setitem(globals(), "GradientSteps", cuda_stand_in)
+    steps = train(*repeated)
+    kinds = eager[0].cycle
+    assert FakeGraph.made == len(steps.captured) == kinds and steps.eager == [EAGER_STEPS] * kinds
+    for one, other in zip(outcome(eager[0]), outcome(repeated[0]), strict=True):
+        assert one["updates"] == other["updates"]
+        for what in ("parameters", "optimizers", "memory", "streams"):
+            assert one[what].keys() == other[what].keys()
+            assert all(torch.equal(value, other[what][key]) for key, value in one[what].items()), what
+    assert torch.equal(*(replay.streams.generators[1].get_state() for replay in (eager[1], repeated[1])))
+
+
+def test_a_tape_hands_out_the_same_tensors_and_draws_anew_only_when_told():
+    numbers = iter(range(10))
+    tape = Tape()
+    first, second = (tape.deliver(lambda: torch.tensor([next(numbers)]), torch.device("cpu")) for _ in range(2))
+    tape.rewind()
+    assert tape.deliver(None, None) is first and tape.deliver(None, None) is second
+    assert [first.item(), second.item()] == [0, 1]
+    tape.draw_again()
+    assert [first.item(), second.item()] == [2, 3]
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("task", ["W+M", "R+T"])
+def test_a_gradient_step_asks_nothing_of_its_device(name, task):
+    agent, replay, _ = make(name, task)
+    batch, there = replay.sample(BATCH), make(name, task, "meta")[0]
+    on_meta = batch._make(x if x is None else x.to("meta") for x in batch)
+    for _ in range(agent.cycle):
+        agent.update(batch)
+        there.update(on_meta)  # an answer that Python would have to wait for raises an error
+    assert all(p.device.type == "meta" for module in there.networks().values() for p in module.parameters())
+    assert {name: losses.shape for name, losses in there.losses.items()} == {
+        name: losses.shape for name, losses in agent.losses.items()
+    }
+
+
+@needs_cuda
+@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("task", ["W+M", "HC+O", "R+T"])
+def test_cuda_learns_what_the_cpu_learns_and_never_waits(name, task):
+    here, there = make(name, task), make(name, task, "cuda")
+    train(*here)
+    steps = GradientSteps(there[0], there[1], BATCH)
+    for number in range(STEPS):
+        torch.cuda.set_sync_debug_mode("error" if number > EAGER_STEPS * there[0].cycle else "default")
+        try:
+            steps()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        there[2](5)
+    assert len(steps.captured) == there[0].cycle
+    for one, other in zip(outcome(here[0]), outcome(there[0]), strict=True):
+        for key, value in one["parameters"].items():
+            torch.testing.assert_close(other["parameters"][key], value, rtol=1e-3, atol=1e-4, msg=key)
+
+
+@needs_cuda
+def test_a_run_on_a_gpu_ends_and_resumes(tmp_path):
+    words = "algo=SRad,DPre env=HC+O seed=0,1 steps=1200 learning_starts=1000 eval_every=600 eval_episodes=1"
+    assert run.main([*words.split(), "final_episodes=1", "device=cuda", f"results={tmp_path}"]) == 0
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="is about machines without a GPU")
+def test_a_gpu_that_is_not_there_is_an_error_in_one_line(capsys):
+    assert run.main(["algo=SRad", "env=R+N", "device=cuda"]) == 2
+    message = capsys.readouterr().err
+    assert message == "run.py: bad value 'cuda' for device; PyTorch sees no CUDA GPU here (choices: cpu)\n"

@@ -11,10 +11,10 @@ has seeds of its own. All cells are measured once before any is measured again, 
 is made, so that what an interruption leaves is of use.
 
 Prints a table and saves `out`/runtime.csv (default bench/results), a row a measurement, which `python plot.py runtime`
-draws. CPU seconds are CPU time of the process, on one thread, so that other load on the machine does not count. With a GPU, the
-two parts make up the wall-clock time: GPU seconds are the time in which its kernels run, from as many further gradient
-steps under PyTorch's profiler, CPU seconds the rest. The first steps capture CUDA graphs; with steps=10000 they hardly
-count, and milliseconds a step times 9e5 are the gradient steps of a run of the paper.
+draws. CPU seconds are CPU time of the process, on one thread, so that other load on the machine does not count. With a
+GPU, the two parts make up the wall-clock time: GPU seconds are the time in which its kernels run, from as many further
+gradient steps under PyTorch's profiler, CPU seconds the rest. The first steps capture CUDA graphs; with steps=10000
+they hardly count, and the time of one step times 9e5 is that of the gradient steps of a whole run.
 """
 
 from __future__ import annotations

@@ -248,7 +248,7 @@ def test_infeasible_action_is_refused_and_projected_on_request(task):
         action = np.array([1.5, 0.0])
     else:
         action = reach_an_infeasible_action(env, np.random.default_rng(0))
-    before, count, step = env._obs.clone(), env.executed_actions, env.elapsed_steps
+    before, count, step = torch.tensor(env._obs), env.executed_actions, env.elapsed_steps
     violation = env.constraint.violation(before, torch.from_numpy(action)).item()
     with pytest.raises(envs.InfeasibleActionError) as refusal:
         env.step(action)

@@ -38,10 +38,8 @@ def step_together(envs, actions):
     """
     if len(set(map(id, envs))) < len(envs) or any(env.constraint is not envs[0].constraint for env in envs):
         raise ValueError("step_together() takes different environments of one constraint")
-    outcomes, checked = [env._well_formed(action) for env, action in zip(envs, actions, strict=True)], []
-    for k, outcome in enumerate(outcomes):
-        if not isinstance(outcome, InfeasibleActionError):
-            checked.append(k)
+    outcomes = [env._well_formed(action) for env, action in zip(envs, actions, strict=True)]
+    checked = [k for k, outcome in enumerate(outcomes) if not isinstance(outcome, InfeasibleActionError)]
     if checked:
         obs = torch.from_numpy(np.array([envs[k]._obs for k in checked]))
         exact = torch.from_numpy(np.array([outcomes[k] for k in checked], np.float64))
@@ -156,9 +154,10 @@ class ActionConstrainedEnv(gymnasium.Env):
         return action
 
     def _execute(self, action, violation):
-        """Execute `action` (in its own precision) or its projection, or return the InfeasibleActionError that refuses it.
+        """What `step` returns for a well-formed `action`, or the InfeasibleActionError that refuses it.
 
-        `violation` (float) is that of `action` at the current observation.
+        Executed is `action` itself (in its own precision) or its projection; `violation` (float) is that of `action` at
+        the current observation.
         """
         if self.project and violation > 0:
             obs, exact = torch.from_numpy(self._obs), torch.from_numpy(action.astype(np.float64))

@@ -64,7 +64,7 @@ def fill_replay(agent: Agent, transitions: int) -> Replay:
     for _ in range(transitions):
         suggested = agent.warm_up(everyone).cpu()
         executed = agent.pull_back(obs, suggested, None)
-        steps = [env.step(action) for env, action in zip(robots, executed.numpy(), strict=True)]
+        steps = envs.step_together(robots, executed.numpy())
         next_obs, reward, terminated = (stack([step[k] for step in steps]) for k in range(3))
         stored = suggested if agent.placement == "environment" else executed
         replay.add(everyone, obs, stored, reward[:, None], terminated[:, None], next_obs)

@@ -56,7 +56,13 @@ class _WeightPatterns(Constraint):
         return ((weight * action) @ patterns.T - self.bound) / torch.where(norm > 0.0, norm, 1.0)
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        return self._excess(obs, action).amax(-1)
+        # The largest of `_excess`, by sums instead of matrix products: those round a sample by the size of its batch,
+        # and an environment's check must not depend on which others are checked with it.
+        weight = self.weight(obs)
+        patterns = self._patterns(action.device)
+        norm = (weight.square().unsqueeze(-2) * patterns.abs()).sum(-1).sqrt()
+        value = ((weight * action).unsqueeze(-2) * patterns).sum(-1)
+        return ((value - self.bound) / torch.where(norm > 0.0, norm, 1.0)).amax(-1)
 
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         return safe_sqrt(self._excess(obs, action).clamp(min=0.0).square().sum(-1))
@@ -111,6 +117,11 @@ class WeightedL1(_WeightPatterns):
 
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
         return weight.abs() * side.sign()
+
+    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
+        weight = self.weight(obs)
+        norm = weight.norm(dim=-1)  # of every row
+        return ((weight * action).abs().sum(-1) - self.bound) / torch.where(norm > 0.0, norm, 1.0)
 
 
 class WeightedPositivePart(_WeightPatterns):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from core.random import stream_seed
-from envs import InfeasibleActionError
+from envs import InfeasibleActionError, step_together
 
 
 class Evaluator:
@@ -49,26 +49,27 @@ class Evaluator:
         return np.concatenate(returns, axis=1)
 
     def _together(self, policy: Callable[[Tensor], Tensor], which: Sequence[int], count: int) -> np.ndarray:
-        envs = [self._envs_of(i)[:count] for i in which]
-        obs = np.stack([[env.reset()[0] for env in row] for row in envs]).astype(np.float32)
-        returns = np.zeros((len(which), count))
-        running = [(i, j) for i in range(len(which)) for j in range(count)]
+        envs = [env for i in which for env in self._envs_of(i)[:count]]
+        obs = np.stack([env.reset()[0] for env in envs]).astype(np.float32)
+        seen = torch.from_numpy(obs).unflatten(0, (len(which), count))  # shares its memory
+        returns = np.zeros(len(envs))
+        running = list(range(len(envs)))
         while running:
             self.check()
-            actions = policy(torch.from_numpy(obs)).numpy()
+            actions = policy(seen).flatten(0, 1).numpy()
             still_running = []
-            for i, j in running:
-                try:
-                    obs[i, j], reward, terminated, truncated, _ = envs[i][j].step(actions[i, j])
-                except InfeasibleActionError as error:
-                    self.refused[which[i]] = str(error)
-                    returns[i, j] = np.nan
+            outcomes = step_together([envs[k] for k in running], actions[running])
+            for k, outcome in zip(running, outcomes, strict=True):
+                if isinstance(outcome, InfeasibleActionError):
+                    self.refused[which[k // count]] = str(outcome)
+                    returns[k] = np.nan
                     continue
-                returns[i, j] += reward
+                obs[k], reward, terminated, truncated, _ = outcome
+                returns[k] += reward
                 if not (terminated or truncated):
-                    still_running.append((i, j))
+                    still_running.append(k)
             running = still_running
-        return returns
+        return returns.reshape(len(which), count)
 
     def _envs_of(self, i: int) -> list[Any]:
         if i not in self.envs:

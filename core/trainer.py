@@ -28,7 +28,7 @@ from core.interrupt import Interrupted
 from core.random import stream_seed
 from core.replay import Replay
 from core.results import RunWriter, has_failed, is_finished, one_line
-from envs import InfeasibleActionError
+from envs import InfeasibleActionError, step_together
 
 COUNTERS = ("steps", "rollout_steps", "owed", "gradient_steps", "evaluated")
 
@@ -171,14 +171,17 @@ class Trainer:
         arrived, reset_obs = self.obs.numpy().copy(), {}
         reward, terminated, ended = (np.zeros((len(self.seeds), 1), dtype=np.float32) for _ in range(3))
         with self._timed("environment"):
+            finite = np.isfinite(suggested.numpy()).all(-1)
             for i in which:
-                try:
-                    if not np.isfinite(suggested[i].numpy()).all():
-                        raise InfeasibleActionError(f"suggested action {suggested[i].tolist()} is not finite")
-                    obs, reward[i], terminated[i], truncated, _ = self.envs[i].step(actions[i])
-                except InfeasibleActionError as error:
-                    self._fail(i, str(error))
+                if not finite[i]:
+                    self._fail(i, f"suggested action {suggested[i].tolist()} is not finite")
+            which = [i for i in which if finite[i]]
+            outcomes = step_together([self.envs[i] for i in which], actions[which])
+            for i, outcome in zip(which, outcomes, strict=True):
+                if isinstance(outcome, InfeasibleActionError):
+                    self._fail(i, str(outcome))
                     continue
+                obs, reward[i], terminated[i], truncated, _ = outcome
                 if not (np.isfinite(obs).all() and np.isfinite(reward[i])):
                     self._fail(i, "observation or reward is not finite")
                     continue

@@ -6,7 +6,7 @@ written "-".
 
 import gymnasium
 
-from envs.constrained import TOLERANCE, ActionConstrainedEnv, InfeasibleActionError, find_task
+from envs.constrained import TOLERANCE, ActionConstrainedEnv, InfeasibleActionError, find_task, step_together
 from envs.tasks import TASKS, Task
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "Task",
     "constraint",
     "make",
+    "step_together",
 ]
 
 

@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import math
 
 import gymnasium
 import numpy as np
@@ -23,6 +24,29 @@ def find_task(name):
     close = difflib.get_close_matches(str(name).upper(), TASKS, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
     raise ValueError(f"unknown task {name!r}{hint} (choices: {' '.join(TASKS)})")
+
+
+def step_together(envs, actions):
+    """Step each `ActionConstrainedEnv` of `envs` with its action (d,) of `actions`, all under one violation check.
+
+    Returns a list: what `step` returns or, for an action that it refuses, the InfeasibleActionError that it raises;
+    the others are executed all the same. Each environment does what it would do alone.
+
+    Raises gymnasium.error.ResetNeeded where an environment needs a reset, and ValueError for environments of different
+    constraints and for one given twice, whose second action would be checked at a past observation. None has then been
+    stepped.
+    """
+    if len(set(map(id, envs))) < len(envs) or any(env.constraint is not envs[0].constraint for env in envs):
+        raise ValueError("step_together() takes different environments of one constraint")
+    outcomes = [env._well_formed(action) for env, action in zip(envs, actions, strict=True)]
+    checked = [k for k, outcome in enumerate(outcomes) if not isinstance(outcome, InfeasibleActionError)]
+    if checked:
+        obs = torch.from_numpy(np.array([envs[k]._obs for k in checked]))
+        exact = torch.from_numpy(np.array([outcomes[k] for k in checked], np.float64))
+        violations = envs[0].constraint.violation(obs, exact).tolist()
+        for k, violation in zip(checked, violations, strict=True):
+            outcomes[k] = envs[k]._execute(outcomes[k], violation)
+    return outcomes
 
 
 class ActionConstrainedEnv(gymnasium.Env):
@@ -54,7 +78,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.robot.obs_dim,), np.float64)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.robot.action_dim,), np.float32)
         self.largest_violation, self.executed_actions, self.elapsed_steps = -np.inf, 0, 0
-        self._obs = None  # current observation as a tensor of its own: callers may write into theirs
+        self._obs = None  # current observation in an array of its own: callers may write into theirs
         self._start, self._actions = None, None  # of the episode: state of the random numbers before it; its actions
 
     def reset(self, *, seed=None, options=None):
@@ -62,7 +86,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         super().reset(seed=seed)
         self._start, self._actions, self.elapsed_steps = self.np_random.bit_generator.state, [], 0
         obs = self.robot.reset(self.np_random)
-        self._obs = torch.from_numpy(obs.copy())
+        self._obs = obs.copy()
         return obs, {}
 
     def step(self, action):
@@ -71,20 +95,10 @@ class ActionConstrainedEnv(gymnasium.Env):
         Raises InfeasibleActionError for a wrong shape, a value that is not finite or, without `project`, a
         violation above 1e-6; gymnasium.error.ResetNeeded before the first reset.
         """
-        if self._obs is None:
-            raise gymnasium.error.ResetNeeded(f"{self.task}: call reset() before step()")
-        action = self._feasible(action)
-        obs, reward, terminated, info = self.robot.step(action)
-        self._obs = torch.from_numpy(obs.copy())
-        self._actions.append(np.array(action))
-        self.executed_actions += 1
-        self.elapsed_steps += 1
-        if self.project:
-            info["executed_action"] = np.array(action, np.float64)
-        truncated = self.elapsed_steps >= self.robot.max_episode_steps
-        if terminated or truncated:  # only a reset can follow
-            self._start, self._actions = None, []
-        return obs, reward, terminated, truncated, info
+        (outcome,) = step_together([self], [action])
+        if isinstance(outcome, InfeasibleActionError):
+            raise outcome
+        return outcome
 
     def get_state(self):
         """Everything that `set_state`, also in another process, needs to go on bit for bit: a dict of numbers, text,
@@ -113,7 +127,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         if state["in_episode"]:
             self.reset()
             for action in () if state["actions"] is None else state["actions"].numpy():
-                self._obs = torch.from_numpy(self.robot.step(action)[0].copy())
+                self._obs = self.robot.step(action)[0]
                 self._actions.append(action)
             self.elapsed_steps = len(self._actions)
         self.executed_actions, self.largest_violation = state["executed_actions"], state["largest_violation"]
@@ -127,26 +141,45 @@ class ActionConstrainedEnv(gymnasium.Env):
         self.robot.close()
         self._obs = None
 
-    def _feasible(self, action):
-        """The action to execute: `action` itself (in its own precision) or its projection."""
+    def _well_formed(self, action):
+        """`action` as an array (d,) of finite numbers, or the InfeasibleActionError that says why it is none."""
+        if self._obs is None:
+            raise gymnasium.error.ResetNeeded(f"{self.task}: call reset() before step()")
         action = np.asarray(action)
         if action.shape != self.action_space.shape:
             expected = self.action_space.shape
-            raise InfeasibleActionError(f"{self._where()}: action has shape {action.shape}, expected {expected}")
-        if not np.isfinite(action).all():
-            raise InfeasibleActionError(f"{self._where()}: action {action} is not finite")
-        exact = torch.from_numpy(action.astype(np.float64))
-        violation = self.constraint.violation(self._obs, exact).item()
+            return InfeasibleActionError(f"{self._where()}: action has shape {action.shape}, expected {expected}")
+        if not all(map(math.isfinite, action.tolist())):
+            return InfeasibleActionError(f"{self._where()}: action {action} is not finite")
+        return action
+
+    def _execute(self, action, violation):
+        """What `step` returns for a well-formed `action`, or the InfeasibleActionError that refuses it.
+
+        Executed is `action` itself (in its own precision) or its projection; `violation` (float) is that of `action` at
+        the current observation.
+        """
         if self.project and violation > 0:
-            exact = self.constraint.project(self._obs, exact)
-            action, violation = exact.numpy(), self.constraint.violation(self._obs, exact).item()
+            obs, exact = torch.from_numpy(self._obs), torch.from_numpy(action.astype(np.float64))
+            exact = self.constraint.project(obs, exact)
+            action, violation = exact.numpy(), self.constraint.violation(obs, exact).item()
         if not violation <= TOLERANCE:  # a NaN is refused as well
-            raise InfeasibleActionError(
+            return InfeasibleActionError(
                 f"{self._where()}: action {action} violates the constraint by {violation:.3g} "
                 f"(at most {TOLERANCE:g} is allowed)"
             )
         self.largest_violation = max(self.largest_violation, violation)
-        return action
+        obs, reward, terminated, info = self.robot.step(action)
+        self._obs = obs.copy()
+        self._actions.append(np.array(action))
+        self.executed_actions += 1
+        self.elapsed_steps += 1
+        if self.project:
+            info["executed_action"] = np.array(action, np.float64)
+        truncated = self.elapsed_steps >= self.robot.max_episode_steps
+        if terminated or truncated:  # only a reset can follow
+            self._start, self._actions = None, []
+        return obs, reward, terminated, truncated, info
 
     def _where(self):
         return f"{self.task}, step {self.elapsed_steps + 1} of the episode"

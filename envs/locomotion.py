@@ -1,12 +1,29 @@
 """HalfCheetah, Hopper and Walker2d on MuJoCo: step for step Gymnasium's `-v4` tasks (the v3 rewards)."""
 
 import ctypes.util
+import functools
 import importlib
 import os
 import sys
 
 import gymnasium
 import numpy as np
+
+
+@functools.cache
+def _load_model(file):
+    """The MuJoCo model of `file`, which robots share: half a megabyte each would crowd the processor's cache."""
+    import mujoco
+
+    # Gymnasium's own path without its `envs.mujoco` package, which would load every MuJoCo task
+    assets = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
+    # half_cheetah.xml makes MuJoCo print a deprecation and leave a MUJOCO_LOG.TXT where the process runs
+    warning_handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        return mujoco.MjModel.from_xml_path(os.path.join(assets, file))
+    finally:
+        mujoco.set_mju_user_warning(warning_handler)
 
 
 class _Locomotion:
@@ -30,17 +47,10 @@ class _Locomotion:
         import mujoco
 
         self._mujoco = mujoco
-        # Gymnasium's own path without its `envs.mujoco` package, which would load every MuJoCo task
-        assets = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
-        # half_cheetah.xml makes MuJoCo print a deprecation and leave a MUJOCO_LOG.TXT where the process runs
-        warning_handler = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(lambda message: None)
-        try:
-            self.model = mujoco.MjModel.from_xml_path(os.path.join(assets, self.model_file))
-        finally:
-            mujoco.set_mju_user_warning(warning_handler)
+        self.model = _load_model(self.model_file)
         self.data = mujoco.MjData(self.model)
-        self._qpos, self._qvel = self.data.qpos, self.data.qvel  # views of the simulator's memory
+        # views of the simulator's memory
+        self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._dt = self.model.opt.timestep * self.frame_skip
         self._picture = None
 
@@ -57,7 +67,7 @@ class _Locomotion:
         The control cost is summed in the action's own precision, as Gymnasium does.
         """
         x_before = float(self._qpos[0])
-        self.data.ctrl[:] = action
+        self._ctrl[:] = action
         self._mujoco.mj_step(self.model, self.data, nstep=self.frame_skip)
         x = float(self._qpos[0])
         x_velocity = (x - x_before) / self._dt

@@ -248,7 +248,7 @@ def test_infeasible_action_is_refused_and_projected_on_request(task):
         action = np.array([1.5, 0.0])
     else:
         action = reach_an_infeasible_action(env, np.random.default_rng(0))
-    before, count, step = env._obs.clone(), env.executed_actions, env.elapsed_steps
+    before, count, step = torch.tensor(env._obs), env.executed_actions, env.elapsed_steps
     violation = env.constraint.violation(before, torch.from_numpy(action)).item()
     with pytest.raises(envs.InfeasibleActionError) as refusal:
         env.step(action)
@@ -317,6 +317,70 @@ def test_what_is_no_action_is_refused(project):
         with pytest.raises(envs.InfeasibleActionError, match=r"H.M, step 1 .* expected \(3,\)"):
             env.step(bad)
     assert env.executed_actions == 0
+
+
+# ---------------------------------------------------------------- several environments at once
+
+
+@pytest.mark.parametrize("task", NAMES)
+def test_stepped_together_each_does_what_it_does_alone(task):
+    """Three environments, the last one projecting, under actions feasible and not, of two precisions, and none."""
+    together, alone = ([envs.make(task, project=i == 2) for i in range(3)] for _ in range(2))
+    for group in (together, alone):
+        for seed, env in enumerate(group):
+            env.reset(seed=seed)
+    rng, refused = np.random.default_rng(0), 0
+    for t in range(200):
+        actions = [draw(rng, env) * rng.choice([SMALL, 1.0, 1.2]) for env in together]
+        actions = [action.astype(np.float32 if t % 2 else np.float64) for action in actions]
+        if t % 10 == 0:
+            actions[t // 10 % 3] = [np.full(len(actions[0]), np.nan), np.zeros(7)][t // 10 % 2]
+        for env, reference, action, outcome in zip(
+            together, alone, actions, envs.step_together(together, actions), strict=True
+        ):
+            try:
+                wanted = reference.step(action)
+            except envs.InfeasibleActionError as error:
+                refused += 1
+                assert type(outcome) is envs.InfeasibleActionError and str(outcome) == str(error)
+            else:
+                np.testing.assert_array_equal(outcome[0], wanted[0])
+                assert outcome[1:4] == wanted[1:4]
+                assert repr(outcome[4]) == repr(wanted[4])
+                if any(wanted[2:4]):
+                    np.testing.assert_array_equal(env.reset()[0], reference.reset()[0])
+            for name in ("executed_actions", "elapsed_steps", "largest_violation"):
+                assert getattr(env, name) == getattr(reference, name)
+    assert 20 < refused < 500
+    assert all(env.executed_actions > 50 and env.largest_violation <= envs.TOLERANCE for env in together)
+    for env in together + alone:
+        env.close()
+
+
+@pytest.mark.parametrize("task", NAMES)
+def test_a_violation_does_not_depend_on_which_others_are_computed_with_it(task):
+    env, generator = envs.make(task), torch.Generator().manual_seed(0)
+    obs = 4 * torch.randn(100, env.robot.obs_dim, dtype=torch.float64, generator=generator)
+    action = 2 * torch.rand(100, env.robot.action_dim, dtype=torch.float64, generator=generator) - 1
+    together = env.constraint.violation(obs, action)
+    for size in (1, 2, 7, 50):
+        parts = zip(obs.split(size), action.split(size), strict=True)
+        assert torch.equal(torch.cat([env.constraint.violation(*part) for part in parts]), together)
+    env.close()
+
+
+def test_what_cannot_be_stepped_together():
+    first, second, other = envs.make("R+N"), envs.make("R+N"), envs.make("R+L2")
+    first.reset(seed=0), other.reset(seed=0)
+    for group in ([first, other], [first, first]):  # a constraint, or an observation, that is not that of the action
+        with pytest.raises(ValueError, match="different environments of one constraint"):
+            envs.step_together(group, np.zeros((2, 2)))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step_together([first, second], np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="shorter"):
+        envs.step_together([first], np.zeros((0, 2)))
+    assert first.executed_actions == other.executed_actions == 0
+    assert envs.step_together([], np.zeros((0, 2))) == []
 
 
 # ---------------------------------------------------------------- Gymnasium's interface

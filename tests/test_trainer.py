@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import nn
 
+import core.evaluation
+import core.trainer
 from algos import ALGORITHMS
 from constraints import WeightedPositivePart
 from core.agent import Agent
@@ -20,6 +22,15 @@ from core.trainer import Trainer
 OBS, DIM = 3, 2
 LENGTHS = (5, 7)  # of every other episode; the shorter ones terminate, the longer ones are cut off
 CONSTRAINT = WeightedPositivePart(lambda obs: obs[..., :DIM] + 1.0, 0.5, DIM)
+
+
+@pytest.fixture(autouse=True)
+def scripted_steps(monkeypatch):
+    """Scripted environments check no action and step by themselves."""
+    for module in (core.trainer, core.evaluation):
+        monkeypatch.setattr(
+            module, "step_together", lambda envs, actions: [env.step(a) for env, a in zip(envs, actions, strict=True)]
+        )
 
 
 class Scripted(gymnasium.Env):

@@ -6,7 +6,6 @@ import signal
 import threading
 from types import FrameType
 
-
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 """Ctrl-C, `kill`, and what batch systems can be told to send before a job's time is over."""
 

@@ -11,13 +11,15 @@ from typing import Any
 def current_job() -> dict[str, Any] | None:
     """Cluster, id and number of restarts of the job that this process belongs to; None outside of Slurm.
 
-    The id is a job's own also in an array, and stays when Slurm starts the job again.
+    The id of one in an array is `<id>_<task>`; it stays when Slurm starts the job again.
     """
     if "SLURM_JOB_ID" not in os.environ:
         return None
+    job, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
     return {
         "cluster": os.environ.get("SLURM_CLUSTER_NAME", ""),
-        "id": os.environ["SLURM_JOB_ID"],
+        # The number of a job in an array may be that of the whole array.
+        "id": f"{job}_{task}" if job else os.environ["SLURM_JOB_ID"],
         "restarts": int(os.environ.get("SLURM_RESTART_COUNT", 0)),
     }
 
@@ -27,6 +29,7 @@ def queue(jobs: Iterable[str]) -> dict[str, str] | None:
 
     None where Slurm cannot be asked.
     """
+    jobs = set(jobs)
     arrays = sorted({job.partition("_")[0] for job in jobs})
     if not arrays:
         return {}
@@ -37,7 +40,8 @@ def queue(jobs: Iterable[str]) -> dict[str, str] | None:
         return None
     if done.returncode:
         return {} if "Invalid job id" in done.stderr else None  # it forgets jobs some minutes after their end
-    return dict(line.split() for line in done.stdout.splitlines())
+    states = dict(line.split() for line in done.stdout.splitlines())
+    return {job: states[job] for job in jobs & states.keys()}
 
 
 def has_ended(job: dict[str, Any]) -> bool:
@@ -45,4 +49,5 @@ def has_ended(job: dict[str, Any]) -> bool:
     here = current_job()
     if here and (here["cluster"], here["id"]) == (job["cluster"], job["id"]):
         return here["restarts"] > job["restarts"]  # Slurm starts a job again when the one before is gone
-    return queue([job["id"]]) == {}
+    queued = queue([job["id"]])
+    return queued is not None and job["id"] not in queued

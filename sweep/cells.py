@@ -137,7 +137,7 @@ def state_of(cell: Cell, jobs: Mapping[str, str]) -> State:
     job = cell.read("job").get("job", "")
     if job in jobs:
         started = jobs[job] not in ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "SPECIAL_EXIT")
-        return State("running" if started else "queued", step, f"job {job}, {jobs[job].lower()}")
+        return State("running" if started else "queued", step, f"job {job}")
     if owner := next(filter(None, map(lock_owner, unended)), None):
         return State("running", step, owner)
     if end := cell.read("end"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from typing import Any
@@ -45,4 +44,5 @@ class Job(Checkpointable):
 
         One that was cancelled is not running any more, and must not come back.
         """
-        return "RUNNING" in (slurm.queue([os.environ["SLURM_JOB_ID"]]) or {}).values()
+        job = JobEnvironment().job_id
+        return (slurm.queue([job]) or {}).get(job) == "RUNNING"

@@ -8,7 +8,9 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stderr
 from dataclasses import fields, replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +80,8 @@ def _submit(executor: Any, free: Sequence[Entry]) -> list[Any]:
     cells = [replace(entry.cell, root=entry.cell.root.absolute()) for entry in free]
     for cell in cells:
         cell.record("end").unlink(missing_ok=True)
-    with executor.batch():
+    # What sbatch says against it is in the exception as well.
+    with redirect_stderr(StringIO()), executor.batch():
         jobs = [
             executor.submit(Job(command_words(entry.config, entry.base), cell))
             for entry, cell in zip(free, cells, strict=True)

@@ -42,20 +42,20 @@ class Queue:
         cell, path = entry.cell, entry.cell.record("log")
         command = [sys.executable, str(RUN), *command_words(entry.config, entry.base)]
         try:
-            with open(path, "a") as log:
-                with self.lock:
-                    if self.stopping:
-                        return None
-                    cell.record("end").unlink(missing_ok=True)
+            with self.lock:
+                if self.stopping:
+                    return None
+                cell.record("end").unlink(missing_ok=True)
+                with open(path, "a") as log:
                     print(f"+ {' '.join(command)} # {datetime.now():%Y-%m-%d %H:%M:%S}", file=log, flush=True)
                     # In a session of its own, as a terminal sends Ctrl-C to every process of its session: a cell must
                     # get one signal, from `stop`, because a second one would end it without a checkpoint.
                     process = subprocess.Popen(
                         command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
                     )
-                    start = time.monotonic()
-                    self.processes[entry] = process, start
-                code = process.wait()
+                start = time.monotonic()
+                self.processes[entry] = process, start
+            code = process.wait()
             with self.lock:
                 del self.processes[entry]
                 if self.stopping and code in (-signal.SIGTERM, 128 + signal.SIGTERM):

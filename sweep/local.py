@@ -81,7 +81,9 @@ def run_queue(entries: Sequence[Entry], jobs: int, check: Callable[[], None]) ->
     """
     waiting = [entry for entry in entries if entry.state.name != "finished"]
     for entry in waiting:
-        entry.cell.record("log").parent.mkdir(parents=True, exist_ok=True)
+        log = entry.cell.record("log")
+        log.parent.mkdir(parents=True, exist_ok=True)
+        log.touch()  # tells `status` of the cell
     queue, display = Queue(), Display(entries, jobs)
     interrupted: Interrupted | None = None
     with ThreadPoolExecutor(jobs) as pool, display:

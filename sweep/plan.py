@@ -88,7 +88,9 @@ def describe_plan(entries: Sequence[Entry], jobs: int) -> str:
     )
     left = [entry for entry in entries if entry.remaining]
     work = [entry.remaining for entry in left]
-    lines = [to_terminal(table, bold=False, width=None), count_states([entry.state for entry in entries])]
+    states = [entry.state for entry in entries]
+    lines = [to_terminal(table, bold=False, width=None), count_states(states)]
+    lines += list_details([entry.cell for entry in entries], states)
     if left:
         memory = sum(sorted((entry.memory for entry in left), reverse=True)[:jobs])
         lines.append(
@@ -100,11 +102,20 @@ def describe_plan(entries: Sequence[Entry], jobs: int) -> str:
 
 
 def describe_state(state: State) -> str:
-    """One line: the state, where it would resume, and the detail."""
+    """A few words: the state, where it would resume, and who has the cell."""
     words = state.name
     if state.step and state.name != "finished":
         words += f", {'at least' if state.name == 'running' else 'resumes from'} step {state.step}"
-    return f"{words}: {state.detail}" if state.detail else words
+    return f"{words}: {state.detail}" if state.name in ("queued", "running") else words
+
+
+def list_details(cells: Sequence[Cell], states: Sequence[State]) -> list[str]:
+    """A line for each cell whose state has a reason: failed, diverged, interrupted with its job."""
+    return [
+        f"{cell.name} seed={format_seeds(cell.seeds)}: {state.detail}"
+        for cell, state in zip(cells, states, strict=True)
+        if state.detail and state.name not in ("queued", "running")
+    ]
 
 
 def count_states(states: Sequence[State]) -> str:

@@ -10,7 +10,7 @@ from core.results import find_runs, has_ended, read_settings
 from core.slurm import queue
 from plots.tables import Table, text_cells, to_terminal
 from sweep.cells import RECORDS, Cell, State, format_seeds, reached, shorten, state_of
-from sweep.plan import count_states, describe_state
+from sweep.plan import count_states, describe_state, list_details
 
 
 def find_cells(root: Path) -> list[Cell]:
@@ -44,7 +44,7 @@ def describe_status(words: Sequence[str]) -> str:
     recorded = {job for cell in cells if (job := cell.read("job").get("job"))}
     jobs = queue(recorded)
     states = [state_of(cell, jobs or {}) for cell in cells]
-    lines = [_table(cells, states), count_states(states)]
+    lines = [_table(cells, states), count_states(states), *list_details(cells, states)]
     if jobs is None:
         lines.append("(squeue does not answer: what is queued or running on the cluster may look interrupted)")
     return "\n".join(lines)

@@ -67,7 +67,7 @@ class Queue:
             return End(1, 0.0, f"{error.filename or 'system'}: {one_line(error)}")
 
     def stop(self) -> None:
-        """Have every process write its checkpoint and end; start no other. A second call ends them at once."""
+        """Have every process write its checkpoint and end, and start no other; a second call ends them at once."""
         with self.lock:
             self.stopping = True
             for process, _ in self.processes.values():
@@ -104,7 +104,6 @@ def run_queue(entries: Sequence[Entry], jobs: int, check: Callable[[], None]) ->
                     display.say("interrupted: waiting for checkpoints (a second time ends without them)")
                     queue.stop()
         except BaseException:
-            queue.stop()
             queue.stop()
             raise
     print(display.summary())

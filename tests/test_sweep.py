@@ -23,6 +23,7 @@ from core.results import find_runs
 from sweep import estimates
 from sweep.cells import Cell, cell_of, command_words, format_seeds, state_of
 from sweep.plan import make_plan
+from sweep.progress import Display, End
 from sweep.settings import parse_sweep
 from sweep.status import find_cells
 
@@ -192,6 +193,21 @@ def test_finished_runs_correct_the_estimates(tmp_path):
     assert after.pop("DPre R+N") == 0 and before.pop("DPre R+N") > 0
     for name, seconds in after.items():
         assert seconds == pytest.approx(3.0 * before[name])
+
+
+def test_the_time_left_follows_the_pace_so_far(tmp_path):
+    entries = plan_of("algo=DPre,DRad,NFW env=R+N seed=0", tmp_path)
+    display = Display(entries, jobs=1)
+    first, *others = entries
+    assert display._eta({first: 0.0}, {first: 0.0}) == pytest.approx(sum(entry.remaining for entry in entries))
+    display.end(first, End(0, 3.0 * first.remaining, ""))
+    rest = sum(entry.remaining for entry in others)
+    assert display._eta({}, {}) == pytest.approx(3.0 * rest)
+    running = {others[0]: 1.5 * others[0].remaining}
+    assert display._eta(running, {others[0]: 0.5}) == pytest.approx(3.0 * (rest - 0.5 * others[0].remaining))
+    display.end(others[0], End(2, 1.0, "a reason"))
+    display.end(others[1], End(3, others[1].remaining, ""))
+    assert display.summary() == "2 of 3 cells done, 1 of them with a seed that diverged, 1 failed"
 
 
 def test_a_dry_run_prints_the_plan_and_leaves_nothing(capsys, tmp_path):

@@ -3,7 +3,7 @@
 # what is missing. Everything else of it is in one temporary folder; a Slurm that the machine has already is left alone.
 #
 #   export SLURM_CONF=$(tests/slurm/single_node.sh start)    # the clients find it by this variable
-#   tests/slurm/single_node.sh stop                          # reads SLURM_CONF
+#   tests/slurm/single_node.sh stop                          # reads SLURM_CONF; the logs stay in that folder
 set -euo pipefail
 
 fail() {
@@ -72,7 +72,8 @@ CONF
 }
 
 stop() {
-    folder=$(dirname "${SLURM_CONF:?set by start}")
+    folder=$(dirname "${SLURM_CONF:-}")
+    case "$folder" in /tmp/single-node-slurm.*) ;; *) fail "SLURM_CONF is not what start printed" ;; esac
     for daemon in slurmd slurmctld munged; do
         [ ! -f "$folder/$daemon.pid" ] || kill "$(cat "$folder/$daemon.pid")" || true
     done

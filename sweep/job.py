@@ -27,6 +27,7 @@ class Job(Checkpointable):
         signum = signal.Signals[f"SIG{JobEnvironment.USR_SIG}"]
         requeue: Any = signal.signal(signum, lambda *_: None)
         log = JobEnvironment().paths.stderr
+        sys.argv = ["run.py", *self.words]  # what info.json says of the command
         try:
             code = main(self.words)
         except Exception:

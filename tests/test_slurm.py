@@ -109,7 +109,7 @@ class Fault:
 
 
 class Requeued(Fault):
-    """Killed, and put back into the queue by its owner."""
+    """Cancelled, which must not bring it back, and then put back into the queue by its owner."""
 
     def strike(self):
         self.send("KILL")
@@ -122,14 +122,14 @@ class Requeued(Fault):
 
 
 class Resubmitted(Fault):
-    """Killed, and found by the next command to be neither finished nor queued."""
+    """Killed without warning, and found by the next command to be neither finished nor queued."""
 
     def __init__(self, cell, root, jobs):
         super().__init__(cell)
         self.root, self.jobs = root, jobs
 
     def strike(self):
-        self.send("KILL")
+        os.kill(self.struck, signal.SIGKILL)
 
     def follow_up(self):
         return not self.is_queued() and submit(self.root, self.jobs) >= 1 and self.job != self.first
@@ -191,6 +191,7 @@ def test_cells_that_are_killed_preempted_or_out_of_time_end_as_on_one_machine(tm
         assert fault.stage == 2
         info = json.loads((fault.cell.folders[0] / "info.json").read_text())
         assert len(info["resumed"]) >= 1 and info["resumed"][0]["step"] > 0
+        assert info["command"].startswith("run.py algo=")
     assert faults["Preempted"].job == faults["Preempted"].first and faults["OutOfTime"].job == faults["OutOfTime"].first
     assert run.main([*WORDS.split(), "threads=1", f"results={tmp_path / 'local'}"]) == 0
     capsys.readouterr()

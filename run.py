@@ -44,6 +44,9 @@ from core.results import (
 )
 from core.trainer import Trainer
 from envs import TASKS, TOLERANCE
+from sweep.launch import launch
+from sweep.settings import SLURM_PREFIX, SlurmSettings, SweepSettings, parse_sweep
+from sweep.status import describe_status
 
 
 def usage() -> str:
@@ -54,6 +57,9 @@ def usage() -> str:
         "  python run.py algo=SRad env=W+M seed=3             one run",
         "  python run.py algo=SRad env=W+M seed=0-9           ten seeds, trained in lockstep in one process",
         "  python run.py algo=DOpt,DRad env=all seed=0,1      several cells, one after the other",
+        "  python run.py algo=all env=all seed=0-9 jobs=4     a queue of cells, four at a time, a process each",
+        "  python run.py algo=all env=all seed=0-9 launcher=slurm slurm.hours=12    an array of Slurm jobs",
+        "  python run.py status results/                      how all cells stand, running, queued or ended",
         "",
         f"algo: {' '.join(ALGORITHMS)}, or all",
         f"env:  {' '.join(TASKS)}, or all",
@@ -63,6 +69,10 @@ def usage() -> str:
     for f in fields(Config):
         if f.name not in ("algo", "env"):
             lines.append(f"  {f.name:18s} {f.metadata['help']}")
+    lines += ["", "keys of a sweep (not part of any run's name):"]
+    for schema, prefix in ((SweepSettings, ""), (SlurmSettings, SLURM_PREFIX)):
+        lines += [f"  {prefix + f.name:18s} {f.metadata['help']}" for f in fields(schema)]
+    lines.append("  slurm.NAME         any other parameter of sbatch, as slurm.account=mine slurm.exclusive=true")
     return "\n".join(lines)
 
 
@@ -86,9 +96,7 @@ def plan(arguments: list[str]) -> list[tuple[Config, Config]]:
             or getattr(base, key) is not None
             or all(getattr(other, key) is None for other in bases)
         }
-        config = resolve(base, applicable)
-        check_device(config.device)
-        cells.append((config, base))
+        cells.append((resolve(base, applicable), base))
     return cells
 
 
@@ -172,6 +180,7 @@ def train(config: Config, base: Config, check: Callable[[], None] = lambda: None
     """Run the seeds of one cell that have not ended, from their checkpoints where there are any, and say what came out
     and where it is. Whether all seeds have a result."""
     torch.set_num_threads(config.threads)
+    check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
         torch.cuda.set_device(config.device)
     check_constraint(config.env)
@@ -296,13 +305,21 @@ def _end_of(folder: Path) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Exit code: 0 done, 2 bad input, 3 a seed diverged, 130 or 143 interrupted by SIGINT or SIGTERM."""
+    """Exit code: 0 done, 2 bad input, 3 a seed diverged, 4 a cell of a sweep failed, 128 + n ended by signal n."""
     if not arguments or {"-h", "--help", "help"} & set(arguments):
         print(usage())
         return 0
     try:
+        if arguments[0] == "status":
+            print(describe_status(arguments[1:]))
+            return 0
         with Interrupts() as interrupts:
-            done = [train(config, base, interrupts.check) for config, base in plan(arguments)]
+            sweep, words = parse_sweep(arguments)
+            cells = plan(words)
+            if sweep.wanted:
+                threads_given = any(word.startswith("threads=") for word in words)
+                return launch(sweep, cells, threads_given, interrupts.check)
+            done = [train(config, base, interrupts.check) for config, base in cells]
     except (ConfigError, ConstraintError, LockedError) as error:
         print(f"run.py: {one_line(error)}", file=sys.stderr)
         return 2

@@ -21,6 +21,11 @@ MapName = Literal["project", "alpha", "radial"]
 Placement = Literal["environment", "rollout", "layer"]
 
 
+def stores_centers(mapping: MapName, constraint: Constraint) -> bool:
+    """Whether the replay buffer has centres, two a transition: where the map needs one other than the origin."""
+    return mapping != "project" and not constraint.origin_centered
+
+
 class Agent(ABC):
     """Base of the algorithms; learning tensors are (seeds, batch, features).
 
@@ -60,7 +65,7 @@ class Agent(ABC):
     @property
     def stores_centers(self) -> bool:
         """Whether the map needs a centre other than the origin: it is then computed once and replayed."""
-        return self.mapping != "project" and not self.constraint.origin_centered
+        return stores_centers(self.mapping, self.constraint)
 
     def feasible(self, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
         """The feasible action that the algorithm's map makes of a suggestion."""

@@ -180,6 +180,12 @@ class CheckpointFolder:
             self.folder.rmdir()
 
 
+def saved_step(run_folder: str | Path) -> int:
+    """The environment steps that the newest checkpoint of a run holds, by the names of its files; 0 without one."""
+    names = (path.stem for path in Path(run_folder, "checkpoint").glob("replay-*.f32"))
+    return max((int(name.rpartition("-")[2]) for name in names), default=0)
+
+
 def choose(
     intact: Mapping[int, Sequence[Checkpoint]], started: Mapping[int, tuple[int, ...]]
 ) -> tuple[list[dict[int, Checkpoint]], list[int]]:

@@ -8,7 +8,7 @@ import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 
@@ -186,9 +186,23 @@ def parse_seeds(text: str) -> list[int]:
     return sorted(seeds)
 
 
-def _typed(key: str, text: str) -> object:
+def override(config: DictConfig, schema: type, key: str, text: str, prefix: str = "") -> None:
+    """Set one key of a structured config, the dataclass `schema`; ConfigError where `text` is not of its type.
+
+    `prefix` stands before the key on the command line.
+    """
+    if text in ("null", "None", "~"):
+        raise ConfigError(f"bad value {text!r} for {prefix}{key}: a value is needed")
+    try:
+        OmegaConf.update(config, key, _typed(schema, key, text))
+    except OmegaConfBaseException:
+        kind = next(f.type for f in fields(schema) if f.name == key).replace(" | None", "")
+        raise ConfigError(f"bad value {text!r} for {prefix}{key}: expected {kind}") from None
+
+
+def _typed(schema: type, key: str, text: str) -> object:
     """The text of one override, made ready for the type check of its field."""
-    kind = typing.get_type_hints(Config)[key]
+    kind = typing.get_type_hints(schema)[key]
     if typing.get_origin(kind) is list:
         return [_whole(part) for part in text.removeprefix("[").removesuffix("]").split(",")]
     if int in (kind, *typing.get_args(kind)):
@@ -213,13 +227,7 @@ def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
             continue
         if getattr(base, key) is None:
             raise ConfigError(f"{key} does not apply to {base.algo}")
-        if text in ("null", "None", "~"):
-            raise ConfigError(f"bad value {text!r} for {key}: a value is needed")
-        try:
-            OmegaConf.update(config, key, _typed(key, text))
-        except OmegaConfBaseException:
-            kind = next(f.type for f in fields(Config) if f.name == key).replace(" | None", "")
-            raise ConfigError(f"bad value {text!r} for {key}: expected {kind}") from None
+        override(config, Config, key, text)
     resolved = typing.cast(Config, OmegaConf.to_object(config))
     _check_ranges(resolved)
     return resolved

@@ -1,10 +1,13 @@
-"""SIGINT and SIGTERM as a question that the training loop asks, so that it stops where a checkpoint is possible."""
+"""Signals that ask for the end, as a question of the training loop, so that it stops where a checkpoint is possible."""
 
 from __future__ import annotations
 
 import signal
 import threading
 from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+"""Ctrl-C, `kill`, and what batch systems can be told to send before a job's time is over."""
 
 
 class Interrupted(Exception):
@@ -16,7 +19,7 @@ class Interrupted(Exception):
 
 
 class Interrupts:
-    """While this context is open, the first SIGINT or SIGTERM is only noted, for `check` to raise.
+    """While this context is open, the first of SIGNALS is only noted, for `check` to raise.
 
     A second one does what it always did: it ends the process at once. In a thread other than the main one, where
     Python allows no handlers, signals are not touched.
@@ -28,7 +31,7 @@ class Interrupts:
 
     def __enter__(self) -> Interrupts:
         if threading.current_thread() is threading.main_thread():
-            for signum in (signal.SIGINT, signal.SIGTERM):
+            for signum in SIGNALS:
                 # Started in the background of a script, a process may have been told to ignore SIGINT.
                 if signal.getsignal(signum) is not signal.SIG_IGN:
                     self._previous[signum] = signal.signal(signum, self._note)

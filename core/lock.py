@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from core import slurm
+
 
 class LockedError(RuntimeError):
     """Another process trains this run; the message names it."""
@@ -23,7 +25,7 @@ def run_lock(run_folder: Path) -> Iterator[None]:
 
     The operating system's lock on the open file says whether an owner on this host is alive: it ends with the process,
     however that ends. The file's text names the owner. Not every network file system passes locks on to other hosts,
-    so a file that another host left there counts as held.
+    so a file that another host left there counts as held, unless its owner belonged to a Slurm job that is over.
     """
 
     path = run_folder.with_name(run_folder.name + ".lock")
@@ -33,11 +35,26 @@ def run_lock(run_folder: Path) -> Iterator[None]:
         file = _acquire(path, run_folder)
     try:
         os.truncate(file, 0)
-        os.pwrite(file, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode() + b"\n", 0)
+        owner: dict[str, Any] = {"pid": os.getpid(), "host": socket.gethostname()}
+        if job := slurm.current_job():
+            owner["job"] = job
+        os.pwrite(file, json.dumps(owner).encode() + b"\n", 0)
         yield
     finally:
         path.unlink(missing_ok=True)
         os.close(file)
+
+
+def lock_owner(run_folder: Path) -> str | None:
+    """Who trains the run, as far as its lock file tells; None where nobody does. The lock itself is left alone."""
+    try:
+        owner = _parse(run_folder.with_name(run_folder.name + ".lock").read_bytes())
+    except OSError:
+        return None
+    if owner is None:
+        return None
+    alive = _is_alive(owner["pid"]) if owner["host"] == socket.gethostname() else not _job_is_over(owner)
+    return _name(owner) if alive else None
 
 
 def _acquire(path: Path, run_folder: Path) -> int | None:
@@ -54,10 +71,10 @@ def _acquire(path: Path, run_folder: Path) -> int | None:
             if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
                 raise
             held = owner is not None and owner["host"] == here and _is_alive(owner["pid"])
-        name = f"process {owner['pid']} on {owner['host']}" if owner else "another process"
+        name = _name(owner) if owner else "another process"
         if held:
             raise LockedError(f"{run_folder} is being trained by {name}")
-        if owner and owner["host"] != here:
+        if owner and owner["host"] != here and not _job_is_over(owner):
             raise LockedError(f"{run_folder} is being trained by {name}; if that has ended, delete {path}")
         if path.exists() and os.path.samestat(os.stat(path), os.fstat(file)):
             return file
@@ -69,11 +86,26 @@ def _acquire(path: Path, run_folder: Path) -> int | None:
 
 
 def _read_owner(file: int) -> dict[str, Any] | None:
+    return _parse(os.pread(file, 1000, 0))
+
+
+def _parse(text: bytes) -> dict[str, Any] | None:
     try:
-        owner = json.loads(os.pread(file, 1000, 0))
-        return {"pid": int(owner["pid"]), "host": str(owner["host"])}
-    except (ValueError, KeyError, TypeError):
+        owner = json.loads(text)
+        job = owner.get("job")
+        if job is not None:
+            job = {"cluster": str(job["cluster"]), "id": str(job["id"]), "restarts": int(job["restarts"])}
+        return {"pid": int(owner["pid"]), "host": str(owner["host"]), "job": job}
+    except (ValueError, KeyError, TypeError, AttributeError):
         return None  # just created, or not written by us
+
+
+def _name(owner: dict[str, Any]) -> str:
+    return f"process {owner['pid']} on {owner['host']}"
+
+
+def _job_is_over(owner: dict[str, Any]) -> bool:
+    return owner["job"] is not None and slurm.has_ended(owner["job"])
 
 
 def _is_alive(pid: int) -> bool:

@@ -11,6 +11,7 @@
         checkpoint/      while the run is unfinished: see core/checkpoint.py
     results/<task>/<variant>/seed=<n>.lock
                          while a process trains the run: its process id and host; see core/lock.py
+    results/sweep/       logs and records of sweeps: see sweep/cells.py
 
 `<variant>` is the algorithm's name followed by `,key=value` for each setting that differs from the paper's
 (`DPre+`, `SRad,learning_starts=10000,steps=50000`). Folders moved aside are called `seed=<n>.old-<i>`;
@@ -80,6 +81,23 @@ def has_failed(folder: str | Path) -> bool:
 def has_ended(folder: str | Path) -> bool:
     """Whether nothing is left to do for the run in `folder`: it is finished or has failed."""
     return is_finished(folder) or has_failed(folder)
+
+
+def last_evaluated(folder: str | Path) -> int:
+    """The step of the last evaluation of the run in `folder`; 0 where there is none."""
+    try:
+        steps = _read_evaluations(Path(folder, "evaluations.csv")).step
+    except ValueError:
+        return 0
+    return int(steps[-1]) if len(steps) else 0
+
+
+def read_settings(folder: str | Path) -> dict[str, Any]:
+    """The configuration of the run in `folder`; empty where it cannot be read."""
+    try:
+        return _parse(Path(folder, "config.yaml"), lambda text: yaml.load(text, _YamlLoader))
+    except ValueError:
+        return {}
 
 
 def lockstep_group(folder: str | Path) -> tuple[int, ...]:

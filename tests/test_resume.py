@@ -10,7 +10,7 @@ import torch
 
 import run
 from core.interrupt import Interrupted
-from core.results import read_run
+from core.results import find_runs, read_run
 
 SETTINGS = "steps=240 learning_starts=60 batch_size=8 hidden=[16,16] eval_every=100 eval_episodes=1 final_episodes=1"
 CASES = {
@@ -55,22 +55,22 @@ def train_through(root, words, check):
 
 def outcome(root):
     """Everything that a cell leaves but times, by seed."""
-    outcomes = {}
-    for folder in root.glob("*/*/seed=*"):
-        if not folder.name.partition("=")[2].isdecimal():
-            continue
-        result = read_run(folder).result
-        result.pop("seconds")
-        evaluations = [line.rpartition(",")[0] for line in (folder / "evaluations.csv").read_text().splitlines()]
-        training = folder / "training.csv"
-        outcomes[folder.name] = {
-            "result": result,
-            "evaluations": evaluations,
-            "training": training.read_text() if training.exists() else None,
-            "parameters": {name: torch.load(folder / f"{name}.pt", weights_only=True) for name in ("best", "last")},
-            "files": sorted(path.name for path in folder.iterdir()),
-        }
-    return outcomes
+    return {folder.name: outcome_of(folder) for folder in find_runs(root)}
+
+
+def outcome_of(folder):
+    """The same of one run."""
+    result = read_run(folder).result
+    result.pop("seconds")
+    evaluations = [line.rpartition(",")[0] for line in (folder / "evaluations.csv").read_text().splitlines()]
+    training = folder / "training.csv"
+    return {
+        "result": result,
+        "evaluations": evaluations,
+        "training": training.read_text() if training.exists() else None,
+        "parameters": {name: torch.load(folder / f"{name}.pt", weights_only=True) for name in ("best", "last")},
+        "files": sorted(path.name for path in folder.iterdir()),
+    }
 
 
 def assert_identical(one, other):

@@ -1,0 +1,1 @@
+"""Many cells with one command: as processes on this machine, or as jobs of a Slurm cluster."""

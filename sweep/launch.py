@@ -1,0 +1,39 @@
+"""From the command line to the launcher of a sweep."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from core.config import Config, ConfigError
+from sweep.cluster import queued_jobs, submit
+from sweep.local import cores, run_queue
+from sweep.plan import describe_plan, make_plan, memory_warning
+from sweep.settings import Sweep
+
+
+def launch(sweep: Sweep, cells: Sequence[tuple[Config, Config]], threads_given: bool, check: Callable[[], None]) -> int:
+    """Plan the cells, each (configuration, the paper's), and print the plan or carry it out; the exit code.
+
+    `check` raises Interrupted after a signal. ConfigError for what the user can put right.
+    """
+    on_slurm = sweep.settings.launcher == "slurm"
+    jobs = sweep.slurm.parallel if on_slurm else sweep.settings.jobs or 1
+    if not threads_given:
+        threads = sweep.slurm.cpus if on_slurm else max(1, cores() // jobs)
+        cells = [(replace(config, threads=threads), base) for config, base in cells]
+    if on_slurm and cells[0][0].overwrite:
+        raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
+    queued = queued_jobs(cells)
+    entries = make_plan(cells, queued or {})
+    if sweep.settings.dry:
+        print(describe_plan(entries, jobs))
+        return 0
+    if on_slurm:
+        submit(sweep, cells)
+        check()
+        return 0
+    if warning := memory_warning(entries, jobs):
+        print(warning, file=sys.stderr)
+    return run_queue(entries, jobs, check)

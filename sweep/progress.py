@@ -1,0 +1,109 @@
+"""What a person sees of a sweep on this machine: bars on a terminal, few lines in a file."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from tqdm import tqdm
+
+from sweep.estimates import in_words, makespan
+from sweep.plan import Entry
+
+BAR = "{desc} {percentage:3.0f}%|{bar}|"
+INTERVALS = (2.0, 60.0)
+"""Seconds between two looks into the run folders: on a terminal, and for the lines in a file."""
+
+
+class End(NamedTuple):
+    """How the process of a cell ended."""
+
+    code: int
+    seconds: float
+    reason: str
+
+
+class Display:
+    """Cells done, running with their progress, failed, and when all will be done; a bar for all and one a process."""
+
+    def __init__(self, entries: Sequence[Entry], jobs: int):
+        self.entries, self.jobs = entries, jobs
+        self.done = [entry for entry in entries if entry.state.name == "finished"]
+        self.diverged = [entry for entry in self.done if entry.state.detail]
+        self.failed: dict[Entry, End] = {}
+        self.seconds = self.estimated = 0.0  # of processes that have ended well: what they took, and were to take
+        self.terminal = sys.stderr.isatty()
+        self.next_look = 0.0 if self.terminal else time.monotonic() + INTERVALS[1]
+
+    def __enter__(self) -> Display:
+        count = 1 + min(self.jobs, len(self.entries) - len(self.done)) if self.terminal else 0
+        self.bars = [tqdm(total=1.0, position=i, bar_format=BAR, leave=False) for i in range(count)]
+        self.say(f"{len(self.entries)} cells, {len(self.done)} of them finished already; {self.jobs} at a time")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for bar in self.bars:
+            bar.close()
+
+    def say(self, line: str) -> None:
+        """A line that stays."""
+        tqdm.write(line, file=sys.stderr)
+
+    def end(self, entry: Entry, end: End) -> None:
+        """Count a cell whose process has ended."""
+        if end.code not in (0, 3):
+            self.failed[entry] = end
+            self.say(f"{entry.cell.name}: failed after {in_words(end.seconds)}: {end.reason}")
+            return
+        self.done.append(entry)
+        self.seconds, self.estimated = self.seconds + end.seconds, self.estimated + entry.remaining
+        if end.code == 3:
+            self.diverged.append(entry)
+        how = "finished, a seed diverged" if end.code == 3 else "finished"
+        self.say(f"{entry.cell.name}: {how} after {in_words(end.seconds)} ({len(self.done)} of {len(self.entries)})")
+
+    def show(self, running: Mapping[Entry, float]) -> None:
+        """Show how far the `running` cells are; each comes with the seconds since its start."""
+        if time.monotonic() < self.next_look:
+            return
+        self.next_look = time.monotonic() + INTERVALS[0 if self.terminal else 1]
+        shares = {entry: entry.progress() for entry in running}
+        line = f"{len(self.done)} of {len(self.entries)} cells done, {len(running)} running"
+        if self.failed:
+            line += f", {len(self.failed)} failed"
+        line += f", ETA {in_words(self._eta(running, shares))}"
+        if not self.terminal:
+            cells = ", ".join(f"{entry.cell.name} {share:.0%}" for entry, share in shares.items())
+            self.say(f"{line} ({cells})")
+            return
+        total = sum(entry.seconds(0) for entry in self.entries)
+        over = sum(entry.seconds(0) for entry in (*self.done, *self.failed))
+        self._set(self.bars[0], line, (over + sum(e.seconds(0) * share for e, share in shares.items())) / total)
+        for bar, entry in zip(self.bars[1:], [*running, None][: len(self.bars) - 1], strict=False):
+            self._set(bar, f"  {entry.cell.name}" if entry else "", shares[entry] if entry else 0.0)
+
+    def _set(self, bar: tqdm, text: str, share: float) -> None:
+        bar.n = min(max(share, 0.0), 1.0)
+        bar.set_description_str(text, refresh=False)
+        bar.refresh()
+
+    def _eta(self, running: Mapping[Entry, float], shares: Mapping[Entry, float]) -> float:
+        """Seconds, at the pace of the processes so far, compared with their estimates."""
+        left = {entry: entry.seconds(0) * (1.0 - share) for entry, share in shares.items()}
+        done = sum(max(0.0, entry.remaining - left[entry]) for entry in running)
+        took, estimated = self.seconds + sum(running.values()), self.estimated + done
+        pace = took / estimated if done or self.estimated else 1.0
+        over = {*self.done, *self.failed, *running}
+        waiting = [entry.remaining for entry in self.entries if entry not in over]
+        return makespan([pace * seconds for seconds in (*left.values(), *waiting)], self.jobs)
+
+    def summary(self) -> str:
+        """The last line."""
+        open_cells = len(self.entries) - len(self.done) - len(self.failed)
+        parts = [f"{len(self.done)} of {len(self.entries)} cells done"]
+        parts += [f"{len(self.diverged)} of them with a seed that diverged"] if self.diverged else []
+        parts += [f"{len(self.failed)} failed"] if self.failed else []
+        parts += [f"{open_cells} not done"] if open_cells else []
+        return ", ".join(parts)

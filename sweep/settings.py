@@ -1,0 +1,105 @@
+"""The settings of a sweep: how cells are run, not what they learn, so no run's folder has them in its name."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+from omegaconf import OmegaConf
+
+from core.config import Config, ConfigError, choose, override
+
+SLURM_PREFIX = "slurm."
+LAUNCHERS = ("local", "slurm")
+
+
+@dataclass
+class SlurmSettings:
+    """What each job of a sweep asks Slurm for."""
+
+    partition: str | None = field(default=None, metadata={"help": "partition (default: the cluster's)"})
+    gpus: int = field(default=0, metadata={"help": "GPUs a cell"})
+    cpus: int = field(default=1, metadata={"help": "CPUs a cell, and threads where threads= is not given"})
+    hours: float = field(default=24.0, metadata={"help": "time limit; a longer cell is requeued and resumes"})
+    parallel: int = field(default=256, metadata={"help": "cells running at the same time, at most"})
+
+
+@dataclass
+class SweepSettings:
+    """How the cells of a command are run. Without `jobs`, the local launcher trains them in this process."""
+
+    jobs: int | None = field(default=None, metadata={"help": "cells at the same time, a process each"})
+    launcher: str = field(default="local", metadata={"help": "this machine: 'local'; a job array: 'slurm'"})
+    dry: bool = field(default=False, metadata={"help": "only print the plan: states, time, memory"})
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The settings on the command line; `sbatch` has the further parameters of sbatch, by name."""
+
+    settings: SweepSettings
+    slurm: SlurmSettings
+    sbatch: dict[str, str]
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there is more to do than to train the cells in this process, one after the other."""
+        return self.settings.jobs is not None or self.settings.dry or self.settings.launcher == "slurm"
+
+
+def parse_sweep(arguments: Sequence[str]) -> tuple[Sweep, list[str]]:
+    """The settings of the sweep, and the words that are left: those of the cells.
+
+    ConfigError for an unknown key, one given twice, and a value that does not fit.
+    """
+    own = [f.name for f in fields(SweepSettings)]
+    slurm_names = [f.name for f in fields(SlurmSettings)]
+    settings, slurm = OmegaConf.structured(SweepSettings), OmegaConf.structured(SlurmSettings)
+    sbatch: dict[str, str] = {}
+    words: list[str] = []
+    seen: dict[str, str] = {}
+    for word in arguments:
+        key, equals, value = word.partition("=")
+        name = key.removeprefix(SLURM_PREFIX)
+        if equals and not key.startswith(SLURM_PREFIX):
+            # Here, where all keys are known, so that a misspelt one is told of all choices.
+            choose("key", key, [*(f.name for f in fields(Config)), *own, *(SLURM_PREFIX + n for n in slurm_names)])
+        if key not in own and not key.startswith(SLURM_PREFIX):
+            words.append(word)
+            continue
+        if not equals or not value or not name:
+            raise ConfigError(f"expected key=value, got {word!r}")
+        if key in seen:
+            raise ConfigError(f"key {key!r} given twice: {seen[key]!r} and {value!r}")
+        seen[key] = value
+        if key in own:
+            override(settings, SweepSettings, key, value)
+        elif name in slurm_names:
+            override(slurm, SlurmSettings, name, value, SLURM_PREFIX)
+        else:
+            sbatch[name.replace("_", "-")] = value
+    sweep = Sweep(
+        typing.cast(SweepSettings, OmegaConf.to_object(settings)),
+        typing.cast(SlurmSettings, OmegaConf.to_object(slurm)),
+        sbatch,
+    )
+    _check(sweep, [key for key in seen if key.startswith(SLURM_PREFIX)])
+    return sweep, words
+
+
+def _check(sweep: Sweep, slurm_keys: Sequence[str]) -> None:
+    settings, slurm = sweep.settings, sweep.slurm
+    if settings.launcher not in LAUNCHERS:
+        choose("launcher", settings.launcher, LAUNCHERS)
+    if settings.jobs is not None and settings.jobs < 1:
+        raise ConfigError(f"bad value {settings.jobs} for jobs: must be at least 1")
+    if settings.jobs is not None and settings.launcher == "slurm":
+        raise ConfigError("jobs= is for launcher=local; with launcher=slurm, slurm.parallel= limits the jobs")
+    if slurm_keys and settings.launcher != "slurm":
+        raise ConfigError(f"{slurm_keys[0]}= needs launcher=slurm")
+    for name, least in (("gpus", 0), ("cpus", 1), ("parallel", 1)):
+        if getattr(slurm, name) < least:
+            raise ConfigError(f"bad value {getattr(slurm, name)} for slurm.{name}: must be at least {least}")
+    if not 0 < slurm.hours < float("inf"):
+        raise ConfigError(f"bad value {slurm.hours} for slurm.hours: must be positive and finite")

@@ -1,0 +1,503 @@
+"""Sweeps: settings, plans, estimates, the queue on this machine, records, states, and what Slurm is told."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from test_resume import assert_identical, outcome_of
+
+import plot
+import run
+from core import slurm
+from core.checkpoint import saved_step
+from core.config import parse_seeds
+from core.interrupt import Interrupted, Interrupts
+from core.lock import LockedError, lock_owner, run_lock
+from core.results import find_runs
+from sweep import estimates
+from sweep.cells import Cell, cell_of, command_words, format_seeds, state_of
+from sweep.plan import make_plan
+from sweep.progress import Display, End
+from sweep.settings import parse_sweep
+from sweep.status import find_cells
+
+ROOT = Path(__file__).parents[1]
+SHORT = (
+    "steps=300 learning_starts=100 batch_size=4 hidden=[8,8] eval_every=100 eval_episodes=1 final_episodes=1"
+    " checkpoint_every=20 train_freq=1 gradient_steps=1"
+)
+
+
+def start(words, root, **options):
+    return subprocess.Popen(
+        [sys.executable, "run.py", *words.split(), f"results={root}"],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # Whoever runs the tests in the background may have them ignore the signal, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        **options,
+    )
+
+
+def wait_until(condition, process=None):
+    deadline = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < deadline and (process is None or process.poll() is None)
+        time.sleep(0.05)
+
+
+def outcomes(root):
+    return {str(folder.relative_to(root)): outcome_of(folder) for folder in find_runs(root)}
+
+
+def plan_of(words, root, jobs=()):
+    return make_plan(run.plan([*words.split(), f"results={root}"]), dict(jobs))
+
+
+# ---------------------------------------------------------------- settings
+
+
+def test_settings_of_a_sweep_are_no_settings_of_its_runs():
+    words = ["algo=SRad", "jobs=3", "dry=true", "env=W+M", "seed=1"]
+    sweep, left = parse_sweep(words)
+    assert left == ["algo=SRad", "env=W+M", "seed=1"] and sweep.wanted
+    assert (sweep.settings.jobs, sweep.settings.dry, sweep.settings.launcher) == (3, True, "local")
+    words = "algo=SRad env=W+M launcher=slurm slurm.hours=1.5 slurm.cpus=4 slurm.account=me slurm.mail_type=END"
+    sweep, left = parse_sweep(words.split())
+    assert (sweep.slurm.hours, sweep.slurm.cpus, sweep.slurm.gpus) == (1.5, 4, 0)
+    assert sweep.sbatch == {"account": "me", "mail-type": "END"} and left == ["algo=SRad", "env=W+M"]
+    assert not parse_sweep(["algo=SRad", "env=W+M"])[0].wanted
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        ("job=2", "unknown key 'job'; did you mean jobs?"),
+        ("jbos=2 dry=true", "did you mean jobs?"),
+        ("sluurm.cpus=2", "did you mean slurm.cpus?"),
+        ("jobs=0", "bad value 0 for jobs: must be at least 1"),
+        ("jobs=two", "bad value 'two' for jobs: expected int"),
+        ("jobs=", "expected key=value, got 'jobs='"),
+        ("jobs", "expected key=value, got 'jobs'"),
+        ("jobs=1 jobs=2", "key 'jobs' given twice: '1' and '2'"),
+        ("dry=maybe", "bad value 'maybe' for dry: expected bool"),
+        ("launcher=slrum", "unknown launcher 'slrum'; did you mean slurm? (choices: local, slurm)"),
+        ("launcher=slurm jobs=2", "slurm.parallel="),
+        ("launcher=slurm slurm.cpus=x", "bad value 'x' for slurm.cpus: expected int"),
+        ("launcher=slurm slurm.cpus=0", "bad value 0 for slurm.cpus: must be at least 1"),
+        ("launcher=slurm slurm.hours=0", "bad value 0.0 for slurm.hours"),
+        ("launcher=slurm slurm.hours=nan", "bad value nan for slurm.hours"),
+        ("launcher=slurm slurm.=1", "expected key=value"),
+        ("launcher=slurm overwrite=true", "overwrite=true does not go with launcher=slurm"),
+        ("jobs=2 slurm.cpus=2", "slurm.cpus= needs launcher=slurm"),
+        ("jobs=2 seed=1-0", "is empty"),
+    ],
+)
+def test_wrong_settings(capsys, tmp_path, words, said):
+    assert run.main(["algo=SRad", "env=W+M", *words.split(), f"results={tmp_path}"]) == 2
+    captured = capsys.readouterr()
+    assert said in captured.err and captured.err.count("\n") == 1 and captured.err.startswith("run.py: ")
+    assert not captured.out and not list(tmp_path.iterdir())
+
+
+def test_usage_names_the_settings_of_sweeps(capsys):
+    assert run.main([]) == 0
+    out = capsys.readouterr().out
+    for name in ("jobs", "launcher", "dry", "slurm.partition", "slurm.gpus", "slurm.hours", "status results/"):
+        assert f" {name}" in out
+
+
+# ---------------------------------------------------------------- cells
+
+
+@pytest.mark.parametrize("text", ["3", "0-9", "0-2,4,7-8", "1,3"])
+def test_seeds_as_words(text):
+    assert format_seeds(tuple(parse_seeds(text))) == text
+
+
+def test_the_words_of_a_cell_are_the_same_cell(tmp_path):
+    words = "algo=all env=R+L2,W+M seed=0-9 hidden=[64,32] gamma=0.5 fw_learning_rate=0.5 gsde=false train_freq=7"
+    cells = run.plan([*words.split(), f"results={tmp_path}", "threads=3"])
+    assert len(cells) == 26
+    for cell in cells:
+        assert run.plan(command_words(*cell)) == [cell]
+
+
+# ---------------------------------------------------------------- plans and estimates
+
+
+def test_the_longest_cell_comes_first_and_what_is_done_shortens_it(tmp_path):
+    names = [(e.config.env, e.config.algo) for e in plan_of("algo=DPre,SAlpha env=R+N,HC+O seed=0-9", tmp_path)]
+    assert names == [("HC+O", "SAlpha"), ("HC+O", "DPre"), ("R+N", "SAlpha"), ("R+N", "DPre")]
+    (whole,) = plan_of("algo=SAlpha env=HC+O seed=0-9", tmp_path)
+    for folder in whole.cell.folders:
+        (folder / "checkpoint").mkdir(parents=True)
+        (folder / "checkpoint" / "replay-0-900000.f32").touch()
+    (entry,) = plan_of("algo=SAlpha env=HC+O seed=0-9", tmp_path)
+    assert (entry.state.name, entry.state.step) == ("interrupted", 900_000)
+    assert 0.05 < entry.remaining / whole.remaining < 0.15 and 0.85 < entry.progress() < 0.95
+    assert whole.seconds(0) == whole.remaining and whole.seconds(1_000_000) < 0.01 * whole.seconds(0)
+
+
+def test_estimates_grow_with_what_there_is_to_do(tmp_path):
+    def entry(words):
+        return plan_of(f"env=W+M {words}", tmp_path)[0]
+
+    base = entry("algo=SRad seed=0")
+    assert base.seconds(0) > 3600
+    for more in ("seed=0-9", "batch_size=512", "gradient_steps=4", "eval_every=100", "steps=2e6"):
+        words = f"algo=SRad {more}" if more.startswith("seed") else f"algo=SRad seed=0 {more}"
+        assert entry(words).seconds(0) > 1.05 * base.seconds(0)
+    # 17 numbers of the observation twice, 6 of the action thrice, reward and end, of four bytes each
+    ten, one = entry("algo=SRad seed=0-9").memory, base.memory
+    per_seed = (ten - one) / 9
+    assert 1e6 * 4 * (2 * 17 + 3 * 6 + 2) <= per_seed <= 1e6 * 4 * (2 * 17 + 3 * 6 + 2) + 50e6
+    assert entry("algo=DPre seed=0 buffer_size=10").memory < one
+    assert {row for row in estimates._rates()} == {(c.env, c.algo) for c, _ in run.plan(["algo=all", "env=all"])}
+
+
+def test_makespan():
+    assert estimates.makespan([5, 3, 2, 2], jobs=2) == 7
+    assert estimates.makespan([5, 3, 2, 2], jobs=9) == 5
+    assert estimates.makespan([], jobs=2) == 0
+
+
+def test_times_in_words():
+    assert [estimates.in_words(t) for t in (0.4, 75, 120, 7200, 40 * 3600, 30 * 86400)] == [
+        "0 s", "75 s", "2.0 min", "2.0 h", "1.7 d", "30 d",
+    ]  # fmt: skip
+
+
+def test_finished_runs_correct_the_estimates(tmp_path):
+    words = "algo=DPre,DRad,SRad env=R+N,R+L2 seed=0"
+    before = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
+    (entry,) = plan_of("algo=DPre env=R+N seed=0", tmp_path)
+    folder = entry.cell.folders[0]
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text("algo: DPre\nenv: R+N\nseed: '0'\nsteps: 300000\n")
+    (folder / "evaluations.csv").write_text("step,return_mean,return_1,seconds\n")
+    config, base = run.plan(["algo=DPre", "env=R+N", "seed=0"])[0]
+    took = 3.0 * estimates.seconds(run.Config("DPre", "R+N", steps=300_000), base, 1)
+    result = {"return_mean": 1.0, "seeds_in_lockstep": 1, "seconds": {"total": took}}
+    (folder / "result.json").write_text(json.dumps(result))
+    after = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
+    assert after.pop("DPre R+N") == 0 and before.pop("DPre R+N") > 0
+    for name, seconds in after.items():
+        assert seconds == pytest.approx(3.0 * before[name])
+
+
+def test_the_time_left_follows_the_pace_so_far(tmp_path):
+    entries = plan_of("algo=DPre,DRad,NFW env=R+N seed=0", tmp_path)
+    display = Display(entries, jobs=1)
+    first, *others = entries
+    assert display._eta({first: 0.0}, {first: 0.0}) == pytest.approx(sum(entry.remaining for entry in entries))
+    display.end(first, End(0, 3.0 * first.remaining, ""))
+    rest = sum(entry.remaining for entry in others)
+    assert display._eta({}, {}) == pytest.approx(3.0 * rest)
+    running = {others[0]: 1.5 * others[0].remaining}
+    assert display._eta(running, {others[0]: 0.5}) == pytest.approx(3.0 * (rest - 0.5 * others[0].remaining))
+    display.end(others[0], End(2, 1.0, "a reason"))
+    display.end(others[1], End(3, others[1].remaining, ""))
+    assert display.summary() == "2 of 3 cells done, 1 of them with a seed that diverged, 1 failed"
+
+
+def test_a_dry_run_prints_the_plan_and_leaves_nothing(capsys, tmp_path):
+    words = f"algo=DPre,SRad env=R+N,H+M seed=0-4 jobs=2 dry=true results={tmp_path / 'none'}"
+    assert run.main(words.split()) == 0
+    out = capsys.readouterr().out
+    assert out.count(" new ") == 4 and "4 cells: 4 new" in out and "0-4" in out and " GB" in out
+    assert "on one core in all" in out and "with 2 cells at a time" in out
+    assert not list(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------- the queue on this machine
+
+
+def test_a_cell_that_fails_is_reported_and_the_others_are_carried_on(tmp_path):
+    words = f"algo=DPre,SRad env=R+N seed=3,5 {SHORT} jobs=2"
+    broken = next(e.cell for e in plan_of(words.replace(" jobs=2", ""), tmp_path) if e.config.algo == "SRad")
+    lock = broken.folders[1].with_name("seed=5.lock")
+    lock.mkdir(parents=True)  # in place of a file: the process of this cell cannot go on
+    process = start(words, tmp_path)
+    out, err = process.communicate(timeout=240)
+    assert process.returncode == 4, err
+    assert "1 of 2 cells done, 1 failed" in out
+    assert f"SRad R+N seed=3,5 failed: run.py: {lock}: is a directory\n    {broken.record('log')}" in err
+    assert state_of(broken, {}).name == "failed" and "is a directory" in state_of(broken, {}).detail
+    (done,) = [cell for cell in find_cells(tmp_path) if cell != broken]
+    assert state_of(done, {}).name == "finished"
+    assert done.record("log").read_text().count("return ") == 2 and not done.record("end").exists()
+
+    assert plot.main([str(tmp_path), "format=md"]) == 0
+
+    lock.rmdir()
+    again = start(words, tmp_path)
+    out, err = again.communicate(timeout=240)
+    assert again.returncode == 0 and "2 cells, 1 of them finished already" in err and "2 of 2 cells done" in out
+    assert not broken.record("end").exists() and done.record("log").read_text().count("+ ") == 1
+    whole = tmp_path / "whole"
+    assert run.main([*words.replace("jobs=2", "threads=1").split(), f"results={whole}"]) == 0
+    assert_identical({k: v for k, v in outcomes(tmp_path).items() if not k.startswith("whole")}, outcomes(whole))
+
+
+def test_ctrl_c_checkpoints_all_and_the_same_command_goes_on_bit_by_bit(tmp_path):
+    words = f"algo=DPre,SRad,DAlpha env=R+L2 seed=3,5 {SHORT.replace('steps=300', 'steps=800')} jobs=2 threads=1"
+    root = tmp_path / "broken"
+    process = start(words, root)
+    wait_until(lambda: len([f for f in root.glob("*/*/seed=3") if saved_step(f) > 100]) == 2, process)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes of the session
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 128 + signal.SIGINT, err
+    assert "3 not done" in out and "the same command resumes" in err and "Traceback" not in err
+    assert not list(root.rglob("seed=*.lock"))
+    states = sorted(state_of(cell, {}).name for cell in find_cells(root))
+    assert states == ["interrupted", "interrupted", "new"]
+    for log in root.glob("sweep/*/*/*.log"):
+        assert "interrupted at step" in log.read_text()
+
+    again = start(words, root)
+    out, err = again.communicate(timeout=240)
+    assert again.returncode == 0 and "3 of 3 cells done" in out, err
+    assert sum("resuming from step" in log.read_text() for log in root.glob("sweep/*/*/*.log")) == 2
+    assert run.main([*words.replace(" jobs=2", "").split(), f"results={tmp_path / 'whole'}"]) == 0
+    assert_identical(outcomes(root), outcomes(tmp_path / "whole"))
+
+
+def test_a_killed_process_and_a_diverging_seed_leave_the_others_alone(tmp_path):
+    words = f"algo=DPre,DRad env=R+L2 seed=3,5 {SHORT.replace('steps=300', 'steps=800')} learning_rate=1e30 jobs=2"
+    process = start(words, tmp_path)
+    folder = next(e.cell for e in plan_of(words.replace(" jobs=2", ""), tmp_path) if e.config.algo == "DRad").folders[0]
+    lock = folder.with_name("seed=3.lock")
+    wait_until(lambda: lock.exists() and lock_owner(folder), process)
+    os.kill(json.loads(lock.read_text())["pid"], signal.SIGKILL)
+    out, err = process.communicate(timeout=240)
+    assert process.returncode == 4, err
+    assert "DRad R+L2 seed=3,5 failed: killed by SIGKILL" in err
+    assert "1 of 2 cells done, 1 of them with a seed that diverged, 1 failed" in out
+    assert "seed 3: failed at step" in state_of(next(c for c in find_cells(tmp_path) if "DPre" in c.variant), {}).detail
+
+
+# ---------------------------------------------------------------- states
+
+
+def fake(tmp_path, monkeypatch, **programs):
+    """Programs of Slurm that say what they are told, in front of the others."""
+    folder = tmp_path / "bin"
+    folder.mkdir(exist_ok=True)
+    for name, script in programs.items():
+        path = folder / name
+        path.write_text(f"#!/bin/sh\n{script}\n")
+        path.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+
+
+def test_states(tmp_path):
+    cell = Cell(tmp_path, "R+N", "DPre", (0, 1))
+    assert state_of(cell, {}).name == "new"
+    cell.write("job", {"job": "12_3", "log": "12_3.err"})
+    assert state_of(cell, {"12_3": "PENDING"}).name == "queued"
+    assert state_of(cell, {"12_3": "RUNNING", "12_4": "PENDING"}).name == "running"
+    assert state_of(cell, {"12_4": "RUNNING"}).name == "new"
+    for folder in cell.folders:
+        folder.mkdir(parents=True)
+    assert "job 12_3 is gone" in state_of(cell, {}).detail
+    (cell.folders[0] / "checkpoint").mkdir()
+    (cell.folders[0] / "checkpoint" / "replay-20-40.f32").touch()
+    (cell.folders[1] / "result.json").touch()
+    assert (state_of(cell, {}).name, state_of(cell, {}).step) == ("interrupted", 40)
+    log = tmp_path / "log"
+    log.write_text("  5%|bar\r 10%|bar\nrun.py: the reason\nsrun: error: vm: task 0: Exited\n\n")
+    cell.note_end(2, log)
+    assert state_of(cell, {}).detail == f"run.py: the reason (log: {log})"
+    cell.note_end(-9, log)
+    assert "killed by SIGKILL" in state_of(cell, {}).detail
+    lock = cell.folders[0].with_name("seed=0.lock")
+    lock.write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
+    running = state_of(cell, {})
+    assert (running.name, running.detail) == ("running", f"process {os.getppid()} on {socket.gethostname()}")
+    lock.write_text(json.dumps({"pid": os.getppid(), "host": "elsewhere"}))
+    assert state_of(cell, {}).detail == f"process {os.getppid()} on elsewhere"
+    lock.unlink()
+    (cell.folders[0] / "failed.json").write_text(json.dumps({"step": 7, "quantity": "loss"}))
+    (cell.folders[0] / "config.yaml").write_text("{}")
+    (cell.folders[0] / "evaluations.csv").write_text("step,return_mean,return_1,seconds\n")
+    assert state_of(cell, {}).name == "finished" and "seed 0: failed at step 7: loss" in state_of(cell, {}).detail
+    cell.note_end(3, log)
+    assert not cell.record("end").exists()
+
+
+def test_status_of_a_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    root = tmp_path / "results"
+    queued = Cell(root, "H+M", "SRad,steps=10", (0, 1, 2))
+    queued.write("job", {"job": "7_0", "log": "x"})
+    run.main(["algo=DPre", "env=R+N", "seed=3,5", *SHORT.split(), f"results={root}"])
+    started = root / "R+N" / "DPre,steps=900" / "seed=4"
+    started.mkdir(parents=True)
+    (started / "config.yaml").write_text("steps: 900\n")
+    (started / "evaluations.csv").write_text("step,return_mean,return_1,seconds\n300,1.0,1.0,1.0\n")
+    capsys.readouterr()
+    assert run.main(["status", str(root)]) == 0
+    out = capsys.readouterr().out
+    assert "3 cells: 1 new, 1 finished, 1 interrupted" in out and "300/900" in out and "squeue does not answer" in out
+    fake(tmp_path, monkeypatch, squeue="echo 7_0 PENDING")
+    assert run.main(["status", str(root)]) == 0
+    out = capsys.readouterr().out
+    assert "1 queued" in out and "job 7_0" in out and "squeue does not answer" not in out
+
+
+@pytest.mark.parametrize("words", [["status"], ["status", "a", "b"], ["status", "nowhere"], ["status", "."]])
+def test_status_of_what_is_no_folder_of_results(tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    assert run.main(words) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("run.py: ") and err.count("\n") == 1
+
+
+# ---------------------------------------------------------------- Slurm, where there is none
+
+
+def test_jobs_that_slurm_knows(tmp_path, monkeypatch):
+    assert slurm.queue([]) == {}
+    fake(tmp_path, monkeypatch, squeue='echo "$@" >&2; echo 7_0 RUNNING; echo 7_1 PENDING; echo 8 COMPLETING')
+    assert slurm.queue(["7_1", "8", "9_0"]) == {"7_1": "PENDING", "8": "COMPLETING"}
+    fake(tmp_path, monkeypatch, squeue="echo slurm_load_jobs error: Invalid job id specified >&2; exit 1")
+    assert slurm.queue(["7_1"]) == {}
+    fake(tmp_path, monkeypatch, squeue="echo Unable to contact slurm controller >&2; exit 1")
+    assert slurm.queue(["7_1"]) is None
+    monkeypatch.setenv("PATH", "")
+    assert slurm.queue(["7_1"]) is None
+
+
+@pytest.mark.parametrize(
+    "squeue, here, taken",
+    [
+        ("echo 7_1 RUNNING", {}, False),  # the job goes on elsewhere
+        ("echo 7_0 RUNNING", {}, True),  # its neighbour in the array does
+        ("exit 1", {}, False),  # nobody knows
+        ("exit 1", {"SLURM_ARRAY_TASK_ID": "1", "SLURM_RESTART_COUNT": "1"}, True),  # we are its next incarnation
+        ("exit 1", {"SLURM_ARRAY_TASK_ID": "1"}, False),  # we are a step of the same incarnation
+        ("exit 1", {"SLURM_ARRAY_TASK_ID": "2", "SLURM_RESTART_COUNT": "1"}, False),
+    ],
+)
+def test_the_lock_of_a_job_on_a_node_that_died_is_taken_over(tmp_path, monkeypatch, squeue, here, taken):
+    fake(tmp_path, monkeypatch, squeue=squeue)
+    for name in ("SLURM_JOB_ID", "SLURM_ARRAY_JOB_ID", "SLURM_CLUSTER_NAME", "SLURM_RESTART_COUNT"):
+        monkeypatch.delenv(name, raising=False)
+    lock = tmp_path / "seed=1.lock"
+    job = {"cluster": "big", "id": "7_1", "restarts": 0}
+    lock.write_text(json.dumps({"pid": 7, "host": "node-12", "job": job}))
+    if here:
+        slurm_variables = {"SLURM_JOB_ID": "9", "SLURM_ARRAY_JOB_ID": "7", "SLURM_CLUSTER_NAME": "big"}
+        for name, value in (slurm_variables | here).items():
+            monkeypatch.setenv(name, value)
+    assert (lock_owner(tmp_path / "seed=1") is None) == taken
+    if not taken:
+        with pytest.raises(LockedError, match="by process 7 on node-12"):
+            run_lock(tmp_path / "seed=1").__enter__()
+        return
+    with run_lock(tmp_path / "seed=1"):
+        owner = json.loads(lock.read_text())
+        assert owner["pid"] == os.getpid() and owner.get("job", {}).get("restarts") == (1 if here else None)
+
+
+@pytest.mark.parametrize("signum", [signal.SIGUSR1, signal.SIGUSR2])
+def test_the_signals_of_batch_systems_are_noted(signum):
+    with Interrupts() as interrupts:
+        os.kill(os.getpid(), signum)
+        with pytest.raises(Interrupted):
+            interrupts.check()
+
+
+def test_without_slurm_or_submitit_one_line_says_so(tmp_path, monkeypatch, capsys):
+    words = ["algo=DPre", "env=R+N", "launcher=slurm", f"results={tmp_path / 'results'}"]
+    with monkeypatch.context() as patch:
+        patch.setenv("PATH", str(tmp_path))
+        assert run.main(words) == 2
+    assert "there is no sbatch on the PATH" in capsys.readouterr().err
+    fake(tmp_path, monkeypatch, sbatch="exit 1")
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    assert run.main(words) == 2
+    assert "pip install '.[slurm]'" in capsys.readouterr().err
+    assert not (tmp_path / "results").exists()
+
+
+@pytest.fixture
+def cluster(tmp_path, monkeypatch):
+    """Slurm's programs in name: jobs are accepted, and never run."""
+    pytest.importorskip("submitit")
+    (tmp_path / "queue").write_text("")
+    number = f'n=$(($(cat {tmp_path}/n 2>/dev/null || echo 40) + 1)); echo $n > {tmp_path}/n; cp "$1" {tmp_path}/$n.sh'
+    fake(
+        tmp_path, monkeypatch, srun="", squeue=f"cat {tmp_path}/queue", sbatch=f"{number}; echo Submitted batch job $n"
+    )
+    return tmp_path
+
+
+def test_only_what_is_neither_finished_nor_queued_is_submitted(cluster, capsys):
+    root = cluster / "results"
+    words = [
+        *f"algo=DPre,SRad,NFW env=R+N,R+L2 seed=3,5 {SHORT} launcher=slurm slurm.partition=short".split(),
+        *[
+            "slurm.hours=2.5",
+            "slurm.cpus=3",
+            "slurm.gpus=1",
+            "slurm.parallel=4",
+            "slurm.account=me",
+            "slurm.exclusive=true",
+        ],
+        f"results={root}",
+    ]
+    run.main(["algo=NFW", "env=R+L2", "seed=3,5", *SHORT.split(), f"results={root}"])
+    capsys.readouterr()
+    assert run.main(words) == 0
+    out = capsys.readouterr().out
+    assert "6 cells: 5 new, 1 finished" in out and "submitted 5 as job 41" in out
+    script = (cluster / "41.sh").read_text()
+    for said in (
+        "--array=0-4%4", "--partition=short", "--time=150", "--cpus-per-task=3", "--gpus-per-node=1", "--account=me",
+        "--exclusive\n", "--requeue\n", "--signal=USR2@120", "--mem=1GB",
+    ):  # fmt: skip
+        assert f"#SBATCH {said}" in script
+    cells = {cell.read("job")["job"]: cell for cell in find_cells(root) if cell.read("job")}
+    assert sorted(cells) == [f"41_{task}" for task in range(5)]
+
+    (cluster / "queue").write_text("".join(f"41_{task} PENDING\n" for task in range(5)))
+    assert run.main(words) == 0
+    assert "nothing to submit" in capsys.readouterr().out and not (cluster / "42.sh").exists()
+
+    (cluster / "queue").write_text("41_0 RUNNING\n41_1 PENDING\n41_2 RUNNING\n41_4 COMPLETING\n")
+    assert run.main(words) == 0
+    assert "submitted 1 as job 42" in capsys.readouterr().out
+    assert cells["41_3"].read("job")["job"] == "42" and "--array" not in (cluster / "42.sh").read_text()
+    assert len(list(root.glob("*/*/seed=*/result.json"))) == 2
+
+
+def test_what_sbatch_refuses_is_said_in_one_line(cluster, monkeypatch, capsys):
+    words = ["algo=DPre", "env=R+N", "launcher=slurm", f"results={cluster / 'results'}"]
+    fake(cluster, monkeypatch, sbatch="echo 'sbatch: error: invalid partition specified: x' >&2; exit 1")
+    assert run.main([*words, "slurm.partition=x"]) == 2
+    err = capsys.readouterr().err
+    assert err == "run.py: sbatch: error: invalid partition specified: x\n"
+    refusal = "if [ \"$1\" = --help ]; then echo '  --account=name --nice'; exit; fi"
+    fake(cluster, monkeypatch, sbatch=f"{refusal}; echo \"sbatch: unrecognized option '--acount=me'\" >&2; exit 1")
+    assert run.main([*words, "slurm.acount=me"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "unknown sbatch parameter 'acount'; did you mean account?" in err
+    fake(cluster, monkeypatch, squeue="exit 1")
+    next(iter(find_cells_of(cluster))).write("job", {"job": "41", "log": "x"})
+    assert run.main(words) == 2
+    assert "squeue does not answer" in capsys.readouterr().err
+
+
+def find_cells_of(cluster):
+    return [cell_of(*cell) for cell in run.plan(["algo=DPre", "env=R+N", f"results={cluster / 'results'}"])]

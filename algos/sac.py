@@ -202,7 +202,7 @@ class SAC(Agent):
         q = self.critic(batch.obs, batch.action)
         self.descend("critic", 0.5 * (q - q_target).square().mean(-1))
 
-        value = self.critic(batch.obs, action).amin(0) - alpha * log_prob
+        value = torch.minimum(*self.critic(batch.obs, action)) - alpha * log_prob
         self.descend("actor", (self.penalty(batch.obs, suggested) - value).mean(-1))
         soft_update(self.critic_target, self.critic, self.config.tau)
 

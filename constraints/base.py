@@ -37,6 +37,8 @@ class Constraint(ABC):
 
     origin_centered: bool = True
     """True where `center(obs)` is the origin for every obs, so that no centre needs to be stored."""
+    solved_on_cpu: bool = False
+    """True where a solver on the CPU is asked, so that a GPU has to wait: no CUDA graph can hold such a set."""
 
     def __init__(self, dim: int):
         if dim < 1:

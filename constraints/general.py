@@ -98,6 +98,7 @@ class GeneralConstraint(Constraint):
     """A set that `explicit(obs)` writes out. A subclass adds `_violation`, `_penalty` and `_gauge_gradients`."""
 
     origin_centered = False
+    solved_on_cpu = True
 
     @abstractmethod
     def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:

@@ -43,7 +43,8 @@ class Tape:
     def draw_again(self) -> None:
         """New numbers from the streams, into the same tensors; the device is not waited for."""
         for draw, numbers in self.entries:
-            numbers.copy_(draw(), non_blocking=True)
+            drawn = draw()
+            numbers.copy_(drawn.pin_memory() if numbers.is_cuda else drawn, non_blocking=True)
 
 
 class CapturedStep:
@@ -52,25 +53,26 @@ class CapturedStep:
     def __init__(self, agent: Agent, step: Callable[[], None], tape: Tape):
         self.agent, self.tape = agent, tape
         self.graph = torch.cuda.CUDAGraph()
-        updates = agent.updates
+        updates, losses = agent.updates, agent.losses
+        agent.losses = {}
         tape.rewind()
         with torch.cuda.graph(self.graph):
             step()
         self.counted, agent.updates = agent.updates - updates, updates
-        self.losses = dict(agent.losses)  # in the graph's memory: each repetition fills them
+        self.losses, agent.losses = agent.losses, losses  # in the graph's memory: each repetition fills them
 
     def repeat(self) -> None:
         self.tape.draw_again()
         self.graph.replay()
         self.agent.updates += self.counted
-        self.agent.losses = self.losses
+        self.agent.losses |= self.losses
 
 
 class GradientSteps:
     """Calling it takes one gradient step of every seed of `agent`, on a batch from `replay`.
 
     On a GPU the first steps of each of the agent's kinds are taken one operation after the other, later ones as graphs,
-    and no call waits for the GPU.
+    and no call waits for the GPU. Only sets that are solved on the CPU cannot be part of a graph.
     """
 
     def __init__(self, agent: Agent, replay: Replay, batch_size: int):
@@ -80,7 +82,7 @@ class GradientSteps:
         self.captured: dict[int, CapturedStep] = {}
 
     def __call__(self) -> None:
-        if self.agent.device.type != "cuda":
+        if self.agent.device.type != "cuda" or self.agent.constraint.solved_on_cpu:
             self._step()
             return
         kind = self.agent.updates % self.agent.cycle

@@ -96,41 +96,33 @@ def soft_update(target: Network, source: Network, tau: float) -> None:
 
 
 class Adam(torch.optim.Adam):
-    """Adam with PyTorch's defaults; a step is one call of the fused kernel on lists made once.
+    """Adam with PyTorch's defaults; a step is one call of the fused kernel, and little else.
 
-    PyTorch's own `step` gathers them anew each time, which takes longer than the kernel on networks of this size.
+    The checks and hooks around PyTorch's own `step` take longer than the kernel on networks of this size.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], learning_rate: float):
         super().__init__(parameters, lr=learning_rate, fused=True)
-        self.parameters: list[Tensor] = [*self.param_groups[0]["params"]]
-        self.count = torch.zeros((), device=self.parameters[0].device)
-        for parameter in self.parameters:
+        for parameter in self.param_groups[0]["params"]:
             moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
-            self.state[parameter] = {"step": self.count, **moments}
-
-    @cached_property
-    def moments(self) -> list[list[Tensor]]:
-        """First and second moments of all parameters."""
-        return [[self.state[parameter][name] for parameter in self.parameters] for name in ("exp_avg", "exp_avg_sq")]
-
-    def _patch_step_function(self) -> None:
-        """PyTorch would wrap `step` into hooks for its profiler, which take longer than the step."""
+            self.state[parameter] = {"step": torch.zeros((), device=parameter.device), **moments}
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """One step along the parameters' `grad`."""
-        self.count += 1
         (group,) = self.param_groups
+        parameters = group["params"]
+        states = [self.state[parameter] for parameter in parameters]
+        counts = [state["step"] for state in states]
+        torch._foreach_add_(counts, 1)
         beta1, beta2 = group["betas"]
-        exp_avgs, exp_avg_sqs = self.moments
         torch._fused_adam_(
-            self.parameters,
-            [parameter.grad for parameter in self.parameters],
-            exp_avgs,
-            exp_avg_sqs,
+            parameters,
+            [parameter.grad for parameter in parameters],
+            [state["exp_avg"] for state in states],
+            [state["exp_avg_sq"] for state in states],
             [],
-            [self.count] * len(self.parameters),
+            counts,
             lr=group["lr"],
             beta1=beta1,
             beta2=beta2,
@@ -139,6 +131,8 @@ class Adam(torch.optim.Adam):
             amsgrad=False,
             maximize=False,
         )
+
+    step.hooked = True  # type: ignore[attr-defined]  # tells PyTorch not to wrap it for its profiler
 
 
 def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:

@@ -154,15 +154,15 @@ class Trainer:
         """One gradient step: all seeds that have not ended owe some."""
         with self._timed("update"):
             self.take_gradient_step()
-        for i in live:
-            self.owed[i] -= 1
-            self.gradient_steps[i] += 1
-            if not self.owed[i]:
-                self.agent.start_rollout([i])
-        # To ask a GPU is to wait for it; what is not finite stays so.
-        if self.agent.device.type == "cpu" or not all(self.owed[i] for i in live):
-            for i, quantity in self.agent.diverged().items():
-                self._fail(i, f"{quantity} is not finite")
+            for i in live:
+                self.owed[i] -= 1
+                self.gradient_steps[i] += 1
+            # To ask a GPU is to wait for it, so it is asked at the end of a block; what is not finite stays so.
+            if self.agent.device.type == "cpu" or not all(self.owed[i] for i in live):
+                for i, quantity in self.agent.diverged().items():
+                    self._fail(i, f"{quantity} is not finite")
+        if done := [i for i in live if not self.owed[i]]:
+            self.agent.start_rollout(done)
 
     def _step(self, which: Sequence[int]) -> None:
         """One environment step of the seeds `which`."""

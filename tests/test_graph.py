@@ -14,8 +14,11 @@ import core.graph
 import envs
 import run
 from algos import ALGORITHMS
+from constraints import LinearConstraint
 from core.graph import EAGER_STEPS, GradientSteps, Tape
+from core.interrupt import Interrupted
 from core.replay import Replay
+from core.results import read_run
 
 SEEDS = [3, 8]
 BATCH = 16
@@ -190,9 +193,42 @@ def test_cuda_learns_what_the_cpu_learns_and_never_waits(name, task):
 
 
 @needs_cuda
-def test_a_run_on_a_gpu_ends_and_resumes(tmp_path):
-    words = "algo=SRad,DPre env=HC+O seed=0,1 steps=1200 learning_starts=1000 eval_every=600 eval_episodes=1"
-    assert run.main([*words.split(), "final_episodes=1", "device=cuda", f"results={tmp_path}"]) == 0
+@pytest.mark.parametrize("name", ["DPre", "SRad"])
+def test_a_run_on_a_gpu_is_interrupted_and_resumed_with_the_same_bits(name, tmp_path):
+    words = f"algo={name} env=W+M seed=0,1 steps=300 learning_starts=100 train_freq=20 gradient_steps=20 device=cuda"
+    words += " hidden=[16,16] batch_size=16 eval_every=100 eval_episodes=1 final_episodes=1"
+
+    def train(folder, check=lambda: None):
+        ((config, base),) = run.plan([*words.split(), f"results={folder}"])
+        return run.train(config, base, check)
+
+    calls = []
+
+    def interrupt():
+        calls.append(None)
+        if len(calls) == 700:
+            raise Interrupted(15)
+
+    train(tmp_path / "whole")
+    with pytest.raises(Interrupted):
+        train(tmp_path / "broken", interrupt)
+    train(tmp_path / "broken")
+    for whole in (tmp_path / "whole").glob("*/*/seed=*/"):
+        broken = tmp_path / "broken" / whole.relative_to(tmp_path / "whole")
+        one, other = (read_run(folder).result for folder in (whole, broken))
+        assert one["gradient_steps"] > 4 * EAGER_STEPS
+        assert one["returns"] == other["returns"]
+        parameters = [torch.load(folder / "last.pt", weights_only=True) for folder in (whole, broken)]
+        assert all(torch.equal(value, parameters[1][key]) for key, value in parameters[0].items())
+
+
+def test_a_set_that_is_solved_on_the_cpu_is_never_captured(cuda_stand_in, monkeypatch):
+    agent, replay, grow = make("DOpt")
+    agent.constraint = LinearConstraint(
+        A=lambda obs: obs[..., None, : agent.action_dim], b=lambda obs: obs[..., :1] * 0 + 1.0, dim=agent.action_dim
+    )
+    monkeypatch.setitem(globals(), "GradientSteps", cuda_stand_in)
+    assert not train(agent, replay, grow).captured and FakeGraph.made == 0 and agent.updates == STEPS
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="is about machines without a GPU")

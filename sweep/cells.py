@@ -2,7 +2,7 @@
 
     results/sweep/<task>/<variant>/
         seed=<seeds>.log     what the cell's processes on this machine said, one after the other
-        seed=<seeds>.job     the Slurm job that has the cell, and its log
+        seed=<seeds>.job     the Slurm job that has the cell, its cluster and its log
         seed=<seeds>.end     how the last process of the cell ended, where that was not well: exit code and log
 
 The runs themselves, their results and checkpoints are where they always are; a cell's state follows from them.
@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from core import slurm
 from core.checkpoint import saved_step
 from core.config import Config, differences, parse_seeds
 from core.lock import lock_owner
@@ -34,6 +35,10 @@ from core.results import (
 
 RECORDS = "sweep"
 """The folder of logs and records in that of results."""
+UNKNOWN = "UNKNOWN"
+"""In place of the state of a job of a cluster that is not the one that Slurm's programs ask here."""
+NO_ANSWER = "NO_ANSWER"
+"""In place of the state of a job where squeue does not answer."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,12 @@ class Cell:
         except (OSError, ValueError):
             return {}
         return record if isinstance(record, dict) else {}
+
+    @property
+    def job(self) -> str:
+        """The Slurm job that has or had the cell, with its cluster, as two clusters may use a number; or empty."""
+        record = self.read("job")
+        return f"{record['job']} of cluster {record['cluster']}" if record.get("cluster") else record.get("job", "")
 
     def write(self, kind: str, content: Mapping[str, Any]) -> None:
         path = self.record(kind)
@@ -118,8 +129,9 @@ def format_seeds(seeds: tuple[int, ...]) -> str:
 class State:
     """How a cell stands.
 
-    `name` is new, queued, running, interrupted, failed or finished; `step` what the seed furthest behind of those that
-    have not ended could resume from, `detail` what a person may want to know.
+    `name` is new, queued, running, interrupted, failed, finished, or unknown, where Slurm does not tell here whether
+    the cell's job goes on; `step` what the seed furthest behind of those that have not ended could resume from,
+    `detail` what a person may want to know.
     """
 
     name: str
@@ -127,22 +139,37 @@ class State:
     detail: str = ""
 
 
+def job_states(cells: Iterable[Cell]) -> dict[str, str]:
+    """The states of the Slurm jobs of `cells`, by `Cell.job`, without those that are over for certain."""
+    records = {cell.job: cell.read("job") for cell in cells if cell.job}
+    here = slurm.cluster() if any(record.get("cluster") for record in records.values()) else ""
+    own = {name: record["job"] for name, record in records.items() if (record.get("cluster") or here) == here}
+    queued = slurm.queue(own.values())
+    if queued is None:
+        queued = dict.fromkeys(own.values(), NO_ANSWER)
+    others = dict.fromkeys(records.keys() - own.keys(), UNKNOWN)
+    return others | {name: queued[job] for name, job in own.items() if job in queued}
+
+
 def state_of(cell: Cell, jobs: Mapping[str, str]) -> State:
-    """The state of a cell; `jobs` are the states of the jobs in Slurm's queue, by id."""
+    """The state of a cell; `jobs` as from `job_states`."""
     folders = cell.folders
     unended = [folder for folder in folders if not has_ended(folder)]
     if not unended:
         diverged = [f"seed {s}: {_failure(f)}" for s, f in zip(cell.seeds, folders, strict=True) if has_failed(f)]
         return State("finished", detail="; ".join(diverged))
     step = min(saved_step(folder) for folder in unended)
-    job = cell.read("job").get("job", "")
-    if job in jobs:
-        started = jobs[job] not in ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "SPECIAL_EXIT")
-        return State("running" if started else "queued", step, f"job {job}")
+    job, known = cell.job, jobs.get(cell.job)
+    if known not in (None, UNKNOWN, NO_ANSWER):
+        started = known not in ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "SPECIAL_EXIT")
+        return State("running" if started else "queued", step, f"job {cell.read('job')['job']}")
     if owner := next(filter(None, map(lock_owner, unended)), None):
         return State("running", step, owner)
     if end := cell.read("end"):
         return State("failed", step, f"{reason_of(end['exit_code'], Path(end['log']))} (log: {end['log']})")
+    if known:
+        record = cell.record("job")
+        return State("unknown", step, f"Slurm does not tell here of job {job}; if that is over, delete {record}")
     if step or any(folder.exists() for folder in unended):
         return State("interrupted", step, f"job {job} is gone (log: {cell.read('job')['log']})" if job else "")
     return State("new")

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from core.config import Config, ConfigError
-from sweep.cluster import queued_jobs, submit
+from sweep.cells import cell_of, job_states
+from sweep.cluster import submit
 from sweep.local import cores, run_queue
 from sweep.plan import describe_plan, make_plan, memory_warning
 from sweep.settings import Sweep
@@ -25,8 +26,7 @@ def launch(sweep: Sweep, cells: Sequence[tuple[Config, Config]], threads_given: 
         cells = [(replace(config, threads=threads), base) for config, base in cells]
     if on_slurm and cells[0][0].overwrite:
         raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
-    queued = queued_jobs(cells)
-    entries = make_plan(cells, queued or {})
+    entries = make_plan(cells, job_states(cell_of(*cell) for cell in cells))
     if sweep.settings.dry:
         print(describe_plan(entries, jobs))
         return 0

@@ -21,7 +21,7 @@ from core.interrupt import Interrupted, Interrupts
 from core.lock import LockedError, lock_owner, run_lock
 from core.results import find_runs
 from sweep import estimates
-from sweep.cells import Cell, cell_of, command_words, format_seeds, state_of
+from sweep.cells import Cell, cell_of, command_words, format_seeds, job_states, state_of
 from sweep.plan import make_plan
 from sweep.progress import Display, End
 from sweep.settings import parse_sweep
@@ -347,7 +347,9 @@ def test_status_of_a_folder(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert run.main(["status", str(root)]) == 0
     out = capsys.readouterr().out
-    assert "3 cells: 1 new, 1 finished, 1 interrupted" in out and "300/900" in out and "squeue does not answer" in out
+    assert (
+        "3 cells: 1 unknown, 1 finished, 1 interrupted" in out and "300/900" in out and "squeue does not answer" in out
+    )
     fake(tmp_path, monkeypatch, squeue="echo 7_0 PENDING")
     assert run.main(["status", str(root)]) == 0
     out = capsys.readouterr().out
@@ -369,6 +371,8 @@ def test_jobs_that_slurm_knows(tmp_path, monkeypatch):
     assert slurm.queue([]) == {}
     fake(tmp_path, monkeypatch, squeue='echo "$@" >&2; echo 7_0 RUNNING; echo 7_1 PENDING; echo 8 COMPLETING')
     assert slurm.queue(["7_1", "8", "9_0"]) == {"7_1": "PENDING", "8": "COMPLETING"}
+    fake(tmp_path, monkeypatch, squeue='case "$*" in *--states=all*) echo 7_0 SUSPENDED; echo 7_1 TIMEOUT;; esac')
+    assert slurm.queue(["7_0", "7_1"]) == {"7_0": "SUSPENDED"}
     fake(tmp_path, monkeypatch, squeue="echo slurm_load_jobs error: Invalid job id specified >&2; exit 1")
     assert slurm.queue(["7_1"]) == {}
     fake(tmp_path, monkeypatch, squeue="echo Unable to contact slurm controller >&2; exit 1")
@@ -381,7 +385,11 @@ def test_jobs_that_slurm_knows(tmp_path, monkeypatch):
     "squeue, here, taken",
     [
         ("echo 7_1 RUNNING", {}, False),  # the job goes on elsewhere
+        ("echo 7_1 SUSPENDED", {}, False),
+        ("echo 7_1 CANCELLED", {}, True),
         ("echo 7_0 RUNNING", {}, True),  # its neighbour in the array does
+        ("", {"SLURM_CLUSTER_NAME": "small"}, False),  # we ask another cluster
+        ("", {"SLURM_CLUSTERS": "small"}, False),
         ("exit 1", {}, False),  # nobody knows
         ("exit 1", {"SLURM_ARRAY_TASK_ID": "1", "SLURM_RESTART_COUNT": "1"}, True),  # we are its next incarnation
         ("exit 1", {"SLURM_ARRAY_TASK_ID": "1"}, False),  # we are a step of the same incarnation
@@ -389,8 +397,8 @@ def test_jobs_that_slurm_knows(tmp_path, monkeypatch):
     ],
 )
 def test_the_lock_of_a_job_on_a_node_that_died_is_taken_over(tmp_path, monkeypatch, squeue, here, taken):
-    fake(tmp_path, monkeypatch, squeue=squeue)
-    for name in ("SLURM_JOB_ID", "SLURM_ARRAY_JOB_ID", "SLURM_CLUSTER_NAME", "SLURM_RESTART_COUNT"):
+    fake(tmp_path, monkeypatch, squeue=squeue, scontrol="echo 'ClusterName             = big'")
+    for name in ("SLURM_JOB_ID", "SLURM_ARRAY_JOB_ID", "SLURM_CLUSTER_NAME", "SLURM_CLUSTERS", "SLURM_RESTART_COUNT"):
         monkeypatch.delenv(name, raising=False)
     lock = tmp_path / "seed=1.lock"
     job = {"cluster": "big", "id": "7_1", "restarts": 0}
@@ -437,8 +445,11 @@ def cluster(tmp_path, monkeypatch):
     (tmp_path / "queue").write_text("")
     number = f'n=$(($(cat {tmp_path}/n 2>/dev/null || echo 40) + 1)); echo $n > {tmp_path}/n; cp "$1" {tmp_path}/$n.sh'
     fake(
-        tmp_path, monkeypatch, srun="", squeue=f"cat {tmp_path}/queue", sbatch=f"{number}; echo Submitted batch job $n"
-    )
+        tmp_path, monkeypatch, srun="", squeue=f"cat {tmp_path}/queue", sbatch=f"{number}; echo Submitted batch job $n",
+        scontrol="echo 'ClusterName             = big'",
+    )  # fmt: skip
+    for name in ("SLURM_CLUSTERS", "SLURM_CLUSTER_NAME", "SBATCH_CLUSTERS"):
+        monkeypatch.delenv(name, raising=False)
     return tmp_path
 
 
@@ -479,6 +490,29 @@ def test_only_what_is_neither_finished_nor_queued_is_submitted(cluster, capsys):
     assert "submitted 1 as job 42" in capsys.readouterr().out
     assert cells["41_3"].read("job")["job"] == "42" and "--array" not in (cluster / "42.sh").read_text()
     assert len(list(root.glob("*/*/seed=*/result.json"))) == 2
+
+
+def test_a_job_of_another_cluster_is_not_taken_for_gone(cluster, monkeypatch, capsys):
+    words = ["algo=DPre", "env=R+N", f"results={cluster / 'results'}"]
+    assert run.main([*words, "launcher=slurm"]) == 0
+    (cell,) = find_cells_of(cluster)
+    assert cell.read("job")["cluster"] == "big"
+    assert state_of(cell, job_states([cell])).name == "new"  # it is over
+    monkeypatch.setenv("SLURM_CLUSTER_NAME", "small")
+    (cluster / "queue").write_text("41 RUNNING\n")  # another job of that number
+    capsys.readouterr()
+    assert run.main([*words, "launcher=slurm"]) == 0
+    said = f"Slurm does not tell here of job 41 of cluster big; if that is over, delete {cell.record('job')}"
+    out = capsys.readouterr().out
+    assert f"DPre R+N is not submitted: {said}" in out and "nothing to submit" in out
+    assert not (cluster / "42.sh").exists()
+    assert run.main(["status", str(cluster / "results")]) == 0
+    out = capsys.readouterr().out
+    assert "1 cell: 1 unknown" in out and said in out
+    cell.note_end(2, cluster / "log")  # the job itself has said that it is over
+    assert state_of(cell, job_states([cell])).name == "failed"
+    assert run.main([*words, "launcher=slurm", "slurm.clusters=huge"]) == 0
+    assert cell.read("job")["cluster"] == "huge"
 
 
 def test_what_sbatch_refuses_is_said_in_one_line(cluster, monkeypatch, capsys):

@@ -81,12 +81,15 @@ class Cell:
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, lambda file: file.write(json.dumps(content).encode() + b"\n"))
 
-    def note_end(self, code: int, log: Path) -> None:
-        """Keep how a process of this cell ended, for `state_of`; nothing of a process that did well."""
+    def note_end(self, code: int, log: Path, reason: str = "") -> None:
+        """Keep how a process of this cell ended, for `state_of`; nothing of a process that did well.
+
+        The `reason` is in the log where it is not given.
+        """
         if code in (0, 3):
             self.record("end").unlink(missing_ok=True)
         else:
-            self.write("end", {"exit_code": code, "log": str(log)})
+            self.write("end", {"exit_code": code, "log": str(log), "reason": reason})
 
 
 def cell_of(config: Config, base: Config) -> Cell:
@@ -166,7 +169,8 @@ def state_of(cell: Cell, jobs: Mapping[str, str]) -> State:
     if owner := next(filter(None, map(lock_owner, unended)), None):
         return State("running", step, owner)
     if end := cell.read("end"):
-        return State("failed", step, f"{reason_of(end['exit_code'], Path(end['log']))} (log: {end['log']})")
+        reason = end.get("reason") or reason_of(end["exit_code"], Path(end["log"]))
+        return State("failed", step, f"{reason} (log: {end['log']})")
     if known:
         record = cell.record("job")
         return State("unknown", step, f"Slurm does not tell here of job {job}; if that is over, delete {record}")

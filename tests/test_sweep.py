@@ -532,5 +532,72 @@ def test_what_sbatch_refuses_is_said_in_one_line(cluster, monkeypatch, capsys):
     assert "squeue does not answer" in capsys.readouterr().err
 
 
+@pytest.fixture
+def job(cluster, monkeypatch):
+    """A job of a cell, which `end(code, step)` lets train up to a checkpoint of that step and end."""
+    from sweep import job as module
+
+    (cluster / "queue").write_text("41 RUNNING\n")
+    fake(cluster, monkeypatch, scontrol=f'echo "$@" >> {cluster}/scontrol')
+    for name in ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in {"SUBMITIT_EXECUTOR": "slurm", "SUBMITIT_FOLDER": str(cluster), "SLURM_JOB_ID": "41"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(module, "PATIENCE", 0.2)
+    monkeypatch.setattr(module, "PAUSES", (0.01, 0.02))
+    (cell,) = find_cells_of(cluster)
+    previous = signal.signal(signal.SIGUSR2, lambda *_: subprocess.check_call(["scontrol", "requeue", "41"]))
+
+    def end(code, step):
+        def main(words):
+            (cell.folders[0] / "checkpoint").mkdir(parents=True, exist_ok=True)
+            (cell.folders[0] / "checkpoint" / f"replay-0-{step}.f32").touch()
+            return code
+
+        monkeypatch.setattr(run, "main", main)
+        with pytest.raises((SystemExit, subprocess.CalledProcessError)):
+            module.Job(["words"], cell)()
+        signal.signal(signal.SIGUSR2, lambda *_: subprocess.check_call(["scontrol", "requeue", "41"]))
+        requeued = (cluster / "scontrol").exists()
+        (cluster / "scontrol").unlink(missing_ok=True)
+        return requeued
+
+    end.cell = cell
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "argv", sys.argv)
+        yield end
+    signal.signal(signal.SIGUSR2, previous)
+
+
+USR2, TERM = 128 + signal.SIGUSR2, 128 + signal.SIGTERM
+
+
+def test_a_job_requeues_itself_unless_it_was_cancelled(cluster, monkeypatch, job):
+    assert job(USR2, 20) and job(TERM, 30) and not job.cell.record("end").exists()
+    for queue in ("41 COMPLETING\n", "41 CANCELLED\n", ""):
+        (cluster / "queue").write_text(queue)
+        assert not job(TERM, 40)
+    assert not job.cell.record("end").exists()
+    once = f"[ -e {cluster}/asked ] && echo 41 COMPLETING || {{ touch {cluster}/asked; exit 1; }}"
+    fake(cluster, monkeypatch, squeue=once)  # does not answer at first
+    assert not job(TERM, 50)
+    fake(cluster, monkeypatch, squeue="exit 1")
+    assert job(TERM, 60)
+
+
+def test_a_job_that_cannot_be_requeued_says_so(cluster, monkeypatch, job):
+    fake(cluster, monkeypatch, scontrol="exit 1")
+    job(USR2, 20)
+    state = state_of(job.cell, {})
+    assert state.name == "failed" and "could not be requeued: " in state.detail and "scontrol" in state.detail
+
+
+def test_a_job_without_a_checkpoint_before_its_time_limit_is_not_requeued_for_ever(job):
+    assert job(USR2, 20) and not job(USR2, 20)
+    state = state_of(job.cell, {})
+    assert state.name == "failed" and "not requeued: no checkpoint between" in state.detail
+    assert job(TERM, 20)  # preempted at once
+
+
 def find_cells_of(cluster):
     return [cell_of(*cell) for cell in run.plan(["algo=DPre", "env=R+N", f"results={cluster / 'results'}"])]

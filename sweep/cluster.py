@@ -21,13 +21,11 @@ from core.results import one_line
 from core.slurm import cluster
 from sweep.cells import NO_ANSWER, RECORDS, cell_of, command_words, job_states
 from sweep.plan import Entry, count_states, make_plan
-from sweep.settings import SlurmSettings, Sweep
+from sweep.settings import SIGNAL_DELAY, SlurmSettings, Sweep
 
 ROOT = Path(__file__).parents[1]
 REQUEUES = 10_000
 """How often a cell may be stopped by its time limit; each time it has come further."""
-SIGNAL_DELAY = 120
-"""Seconds before the time limit at which Slurm tells a job: enough for a checkpoint of many seeds on a slow disk."""
 SPARE_MEMORY = 1.3
 
 

@@ -54,7 +54,9 @@ def make_plan(cells: Sequence[tuple[Config, Config]], jobs: Mapping[str, str]) -
     entries = []
     for config, base in cells:
         cell = cell_of(config, base)
-        state = State("new", detail="starts again") if config.overwrite else state_of(cell, jobs)
+        state = state_of(cell, jobs)
+        if config.overwrite and state.name not in ("running", "queued", "unknown"):
+            state = State("new", detail="starts again")
         entries.append(Entry(cell, config, base, state, estimates.correct(factors, config.env, config.algo)))
     return sorted(entries, key=lambda entry: -entry.remaining)
 

@@ -76,6 +76,7 @@ def test_settings_of_a_sweep_are_no_settings_of_its_runs():
     assert (sweep.slurm.hours, sweep.slurm.cpus, sweep.slurm.gpus) == (1.5, 4, 0)
     assert sweep.sbatch == {"account": "me", "mail-type": "END"} and left == ["algo=SRad", "env=W+M"]
     assert not parse_sweep(["algo=SRad", "env=W+M"])[0].wanted
+    parse_sweep(["launcher=slurm", "slurm.hours=0.03", "slurm.signal=USR2@30"])
 
 
 @pytest.mark.parametrize(
@@ -95,6 +96,7 @@ def test_settings_of_a_sweep_are_no_settings_of_its_runs():
         ("launcher=slurm slurm.cpus=x", "bad value 'x' for slurm.cpus: expected int"),
         ("launcher=slurm slurm.cpus=0", "bad value 0 for slurm.cpus: must be at least 1"),
         ("launcher=slurm slurm.hours=0", "bad value 0.0 for slurm.hours"),
+        ("launcher=slurm slurm.hours=0.06", "bad value 0.06 for slurm.hours: must be more than 240 seconds"),
         ("launcher=slurm slurm.hours=nan", "bad value nan for slurm.hours"),
         ("launcher=slurm slurm.=1", "expected key=value"),
         ("launcher=slurm overwrite=true", "overwrite=true does not go with launcher=slurm"),
@@ -283,6 +285,23 @@ def test_a_killed_process_and_a_diverging_seed_leave_the_others_alone(tmp_path):
     assert "DRad R+L2 seed=3,5 failed: killed by SIGKILL" in err
     assert "1 of 2 cells done, 1 of them with a seed that diverged, 1 failed" in out
     assert "seed 3: failed at step" in state_of(next(c for c in find_cells(tmp_path) if "DPre" in c.variant), {}).detail
+
+
+def test_cells_that_others_have_are_left_out(tmp_path, monkeypatch, capsys):
+    words = [*f"algo=DPre,SRad,NFW env=R+N seed=3 {SHORT} jobs=1 threads=1".split(), f"results={tmp_path / 'results'}"]
+    cells = {e.config.algo: e.cell for e in plan_of(f"algo=DPre,SRad,NFW env=R+N seed=3 {SHORT}", tmp_path / "results")}
+    fake(tmp_path, monkeypatch, squeue="echo 7 PENDING")
+    cells["SRad"].write("job", {"job": "7", "log": "x"})
+    lock = cells["NFW"].folders[0].with_name("seed=3.lock")
+    lock.parent.mkdir(parents=True)
+    lock.write_text(json.dumps({"pid": 7, "host": "elsewhere"}))
+    for more in ([], ["overwrite=true"]):
+        assert run.main([*words, *more]) == 2
+        captured = capsys.readouterr()
+        assert "1 of 1 cells done" in captured.out and "failed" not in captured.err
+        (line,) = [line for line in captured.err.splitlines() if "left out" in line]
+        assert line.startswith("2 left out, as others have them") and (": job 7" in line or "on elsewhere" in line)
+        assert not cells["SRad"].record("log").exists() and not cells["NFW"].record("log").exists()
 
 
 # ---------------------------------------------------------------- states

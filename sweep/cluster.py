@@ -60,8 +60,8 @@ def submit(sweep: Sweep, cells: Sequence[tuple[Config, Config]]) -> None:
             executor = submitit.AutoExecutor(folder, cluster="slurm", slurm_max_num_timeout=REQUEUES)
             executor.update_parameters(**_parameters(sweep, free))
             submitted = _submit(executor, free, sweep.sbatch.get("clusters"))
-    except LockedError:
-        raise ConfigError(f"another process is submitting cells of {folder.parents[1]} at this moment") from None
+    except LockedError as error:
+        raise ConfigError(f"another command submits cells of {folder.parents[1]} at this moment: {error}") from None
     except submitit.core.utils.FailedJobError as error:
         raise _explain(error) from error
     array = submitted[0].job_id.partition("_")[0]

@@ -195,6 +195,15 @@ def test_finished_runs_correct_the_estimates(tmp_path):
     assert after.pop("DPre R+N") == 0 and before.pop("DPre R+N") > 0
     for name, seconds in after.items():
         assert seconds == pytest.approx(3.0 * before[name])
+    (folder / "result.json").write_text(json.dumps({"return_mean": 1.0, "seeds_in_lockstep": 1}))
+    after = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
+    assert {name: after[name] for name in before} == before
+    (folder / "result.json").write_text(json.dumps(result))
+    (folder / "config.yaml").write_text((folder / "config.yaml").read_text() + "device: cuda:0\n")
+    after = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
+    assert {name: after[name] for name in before} == before
+    after = {entry.cell.name: entry.remaining for entry in plan_of(f"{words} device=cuda", tmp_path)}
+    assert after["DRad R+N"] == pytest.approx(3.0 * before["DRad R+N"])
 
 
 def test_the_time_left_follows_the_pace_so_far(tmp_path):
@@ -436,6 +445,17 @@ def test_the_lock_of_a_job_on_a_node_that_died_is_taken_over(tmp_path, monkeypat
         assert owner["pid"] == os.getpid() and owner.get("job", {}).get("restarts") == (1 if here else None)
 
 
+def test_a_lock_that_another_host_takes_over_while_slurm_is_asked_is_left_to_it(tmp_path, monkeypatch):
+    lock, other = tmp_path / "seed=1.lock", tmp_path / "other"
+    job = {"cluster": "big", "id": "7_1", "restarts": 0}
+    lock.write_text(json.dumps({"pid": 7, "host": "node-12", "job": job}))
+    other.write_text(json.dumps({"pid": 8, "host": "node-13"}))
+    fake(tmp_path, monkeypatch, squeue=f"cat {other} > {lock}")
+    monkeypatch.setenv("SLURM_CLUSTERS", "big")
+    with pytest.raises(LockedError, match="by process 8 on node-13"):
+        run_lock(tmp_path / "seed=1").__enter__()
+
+
 @pytest.mark.parametrize("signum", [signal.SIGUSR1, signal.SIGUSR2])
 def test_the_signals_of_batch_systems_are_noted(signum):
     with Interrupts() as interrupts:
@@ -532,6 +552,15 @@ def test_a_job_of_another_cluster_is_not_taken_for_gone(cluster, monkeypatch, ca
     assert state_of(cell, job_states([cell])).name == "failed"
     assert run.main([*words, "launcher=slurm", "slurm.clusters=huge"]) == 0
     assert cell.read("job")["cluster"] == "huge"
+
+
+def test_a_submission_that_another_host_left_open_names_its_lock(cluster, capsys):
+    lock = cluster / "results" / "sweep" / "submission.lock"
+    lock.parent.mkdir(parents=True)
+    lock.write_text(json.dumps({"pid": 7, "host": "elsewhere"}))
+    assert run.main(["algo=DPre", "env=R+N", "launcher=slurm", f"results={cluster / 'results'}"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and f"by process 7 on elsewhere; if that has ended, delete {lock}" in err
 
 
 def test_what_sbatch_refuses_is_said_in_one_line(cluster, monkeypatch, capsys):

@@ -168,7 +168,7 @@ def state_of(cell: Cell, jobs: Mapping[str, str]) -> State:
         return State("running" if started else "queued", step, f"job {cell.read('job')['job']}")
     if owner := next(filter(None, map(lock_owner, unended)), None):
         return State("running", step, owner)
-    if end := cell.read("end"):
+    if (end := cell.read("end")) and not _started_since(cell.record("end"), unended):
         reason = end.get("reason") or reason_of(end["exit_code"], Path(end["log"]))
         return State("failed", step, f"{reason} (log: {end['log']})")
     if known:
@@ -195,6 +195,16 @@ def reason_of(code: int, log: Path) -> str:
         lines = []
     said = [line.strip() for line in lines if line.strip() and not line.startswith("srun: ")]
     return said[-1] if said else f"exit code {code}"
+
+
+def _started_since(record: Path, folders: Sequence[Path]) -> bool:
+    """Whether a run was started or taken up after `record` was written, as by a `run.py` of its own."""
+    try:
+        # By the clock of the file system, which all hosts share; each start and each resumption writes info.json.
+        written = record.stat().st_mtime_ns
+        return any(info.stat().st_mtime_ns > written for f in folders if (info := f / "info.json").exists())
+    except OSError:  # deleted at this moment
+        return False
 
 
 def _failure(folder: Path) -> str:

@@ -351,6 +351,13 @@ def test_states(tmp_path):
     assert state_of(cell, {}).detail == f"run.py: the reason (log: {log})"
     cell.note_end(-9, log)
     assert "killed by SIGKILL" in state_of(cell, {}).detail
+    info, end = cell.folders[0] / "info.json", cell.record("end")
+    info.touch()
+    os.utime(info, ns=(0, end.stat().st_mtime_ns - 1))
+    assert state_of(cell, {}).name == "failed"
+    os.utime(info, ns=(0, end.stat().st_mtime_ns + 1))  # a run.py of its own, after that
+    assert (state_of(cell, {}).name, state_of(cell, {}).step) == ("interrupted", 40)
+    info.unlink()
     lock = cell.folders[0].with_name("seed=0.lock")
     lock.write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
     running = state_of(cell, {})

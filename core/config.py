@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
@@ -255,6 +256,8 @@ def _check_ranges(config: Config) -> None:
     demand("boundary_weight", config.boundary_weight is None or config.boundary_weight > 0, "must be positive")
     demand("hidden", min(config.hidden) >= 1, "must list positive widths")
     demand("gradient_steps", config.gradient_steps == -1 or config.gradient_steps >= 1, "must be -1 or at least 1")
+    # Whether there is such a GPU, only the machine that trains can tell.
+    demand("device", bool(re.fullmatch(r"cpu|cuda(:[0-9]+)?", config.device)), "must be cpu, cuda or cuda:N")
     freq = config.train_freq
     demand("train_freq", freq == "episode" or (freq.isdecimal() and int(freq) >= 1), "must be steps or 'episode'")
 

@@ -58,7 +58,7 @@ def lock_owner(run_folder: Path) -> str | None:
 
 
 def _acquire(path: Path, run_folder: Path) -> int | None:
-    """The descriptor of the locked file; None if its owner deleted it between our opening and locking it."""
+    """The descriptor of the locked file; None if it was deleted or changed hands since we opened it."""
     file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         owner, here = _read_owner(file), socket.gethostname()
@@ -76,7 +76,9 @@ def _acquire(path: Path, run_folder: Path) -> int | None:
             raise LockedError(f"{run_folder} is being trained by {name}")
         if owner and owner["host"] != here and not _job_is_over(owner):
             raise LockedError(f"{run_folder} is being trained by {name}; if that has ended, delete {path}")
-        if path.exists() and os.path.samestat(os.stat(path), os.fstat(file)):
+        # While Slurm was asked, another host may have taken the file over without our noticing.
+        unchanged = _read_owner(file) == owner
+        if unchanged and path.exists() and os.path.samestat(os.stat(path), os.fstat(file)):
             return file
     except BaseException:
         os.close(file)

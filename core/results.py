@@ -10,7 +10,7 @@
         failed.json      in its place where the run diverged: at which step, what was not finite, last evaluation
         checkpoint/      while the run is unfinished: see core/checkpoint.py
     results/<task>/<variant>/seed=<n>.lock
-                         while a process trains the run: its process id and host; see core/lock.py
+                         while a process trains the run: its process id, host and Slurm job; see core/lock.py
     results/sweep/       logs and records of sweeps: see sweep/cells.py
 
 `<variant>` is the algorithm's name followed by `,key=value` for each setting that differs from the paper's

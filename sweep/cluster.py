@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import shlex
 import shutil
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import redirect_stderr
 from dataclasses import fields, replace
 from io import StringIO
@@ -17,23 +18,15 @@ from typing import Any
 from core.config import Config, ConfigError, choose
 from core.lock import LockedError, run_lock
 from core.results import one_line
-from core.slurm import queue
-from sweep.cells import RECORDS, cell_of, command_words
+from core.slurm import cluster
+from sweep.cells import NO_ANSWER, RECORDS, cell_of, command_words, job_states
 from sweep.plan import Entry, count_states, make_plan
-from sweep.settings import SlurmSettings, Sweep
+from sweep.settings import SIGNAL_DELAY, SlurmSettings, Sweep
 
 ROOT = Path(__file__).parents[1]
 REQUEUES = 10_000
 """How often a cell may be stopped by its time limit; each time it has come further."""
-SIGNAL_DELAY = 120
-"""Seconds before the time limit at which Slurm tells a job: enough for a checkpoint of many seeds on a slow disk."""
 SPARE_MEMORY = 1.3
-
-
-def queued_jobs(cells: Sequence[tuple[Config, Config]]) -> Mapping[str, str] | None:
-    """The states of the jobs of `cells` that are in Slurm's queue, by id; None where Slurm cannot be asked."""
-    jobs = (cell_of(*cell).read("job").get("job") for cell in cells)
-    return queue(job for job in jobs if job)
 
 
 def submit(sweep: Sweep, cells: Sequence[tuple[Config, Config]]) -> None:
@@ -52,31 +45,36 @@ def submit(sweep: Sweep, cells: Sequence[tuple[Config, Config]]) -> None:
     try:
         with run_lock(folder.with_name("submission")):
             # Only now: two commands at the same time must not see the same cells as free.
-            queued = queued_jobs(cells)
-            if queued is None:
+            jobs = job_states(cell_of(*cell) for cell in cells)
+            if NO_ANSWER in jobs.values():
                 raise ConfigError("squeue does not answer, so nobody knows which cells are queued already")
-            entries = make_plan(cells, queued)
+            entries = make_plan(cells, jobs)
             print(count_states([entry.state for entry in entries]))
+            for entry in entries:
+                if entry.state.name == "unknown":
+                    print(f"{entry.cell.name} is not submitted: {entry.state.detail}")
             free = [entry for entry in entries if entry.state.name in ("new", "interrupted", "failed")]
             if not free:
                 print("nothing to submit")
                 return
             executor = submitit.AutoExecutor(folder, cluster="slurm", slurm_max_num_timeout=REQUEUES)
             executor.update_parameters(**_parameters(sweep, free))
-            jobs = _submit(executor, free)
-    except LockedError:
-        raise ConfigError(f"another process is submitting cells of {folder.parents[1]} at this moment") from None
+            submitted = _submit(executor, free, sweep.sbatch.get("clusters"))
+    except LockedError as error:
+        raise ConfigError(f"another command submits cells of {folder.parents[1]} at this moment: {error}") from None
     except submitit.core.utils.FailedJobError as error:
         raise _explain(error) from error
-    array = jobs[0].job_id.partition("_")[0]
+    array = submitted[0].job_id.partition("_")[0]
     print(f"submitted {len(free)} as job {array} (`scancel {array}` ends it; logs in {folder})")
     print(f"`python run.py status {folder.parents[1]}` shows how all cells stand")
 
 
-def _submit(executor: Any, free: Sequence[Entry]) -> list[Any]:
-    """Submit the cells as one array, and record which job has which cell."""
+def _submit(executor: Any, free: Sequence[Entry], clusters: str | None) -> list[Any]:
+    """Submit the cells as one array, and record which job has which cell; `clusters` is what sbatch is told of them."""
     from sweep.job import Job  # here, as it needs submitit
 
+    # Which of several sbatch chose is not worth knowing: squeue is not asked for them either.
+    name = clusters or os.environ.get("SBATCH_CLUSTERS") or cluster()
     cells = [replace(entry.cell, root=entry.cell.root.absolute()) for entry in free]
     for cell in cells:
         cell.record("end").unlink(missing_ok=True)
@@ -87,7 +85,7 @@ def _submit(executor: Any, free: Sequence[Entry]) -> list[Any]:
             for entry, cell in zip(free, cells, strict=True)
         ]
     for cell, job in zip(cells, jobs, strict=True):
-        cell.write("job", {"job": job.job_id, "log": str(job.paths.stderr)})
+        cell.write("job", {"job": job.job_id, "cluster": name, "log": str(job.paths.stderr)})
     return jobs
 
 

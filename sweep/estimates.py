@@ -90,17 +90,23 @@ def memory(config: Config, seeds: int) -> float:
     return PROCESS_BYTES + seeds * (SEED_BYTES + simulators + 4.0 * width * min(config.buffer_size, config.steps))
 
 
-def corrections(runs: Iterable[tuple[Run, Config, Config]]) -> dict[tuple[str, str], float]:
+def corrections(runs: Iterable[tuple[Run, Config, Config]], device: str) -> dict[tuple[str, str], float]:
     """By (task, algorithm), how many times as long as estimated finished runs took; ("", "") has the median of all.
 
-    Each run comes with its configuration and the paper's of the same cell.
+    Each run comes with its configuration and the paper's of the same cell. Those on another kind of `device` are left
+    out, and those whose result does not have its time.
     """
     ratios: dict[tuple[str, str], list[float]] = {}
     for run, config, base in runs:
-        if run.result is not None:
-            took = run.result["seconds"]["total"] / seconds(config, base, run.result["seeds_in_lockstep"])
-            ratios.setdefault((run.task, run.algo), []).append(took)
-            ratios.setdefault(("", ""), []).append(took)
+        if run.result is None or config.device.partition(":")[0] != device.partition(":")[0]:
+            continue
+        try:
+            took, seeds = float(run.result["seconds"]["total"]), int(run.result["seeds_in_lockstep"])
+        except (KeyError, TypeError, ValueError):
+            continue
+        ratio = took / seconds(config, base, seeds)
+        ratios.setdefault((run.task, run.algo), []).append(ratio)
+        ratios.setdefault(("", ""), []).append(ratio)
     return {key: statistics.median(values) for key, values in ratios.items()}
 
 

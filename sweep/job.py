@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import random
 import signal
 import sys
+import time
 from typing import Any
 
 from submitit import JobEnvironment
 from submitit.helpers import Checkpointable
 
 from core import slurm
+from core.checkpoint import saved_step
+from core.results import has_ended, one_line
 from sweep.cells import Cell
+
+PATIENCE = 40.0
+"""Seconds to go on asking a squeue that does not answer: a part of SIGNAL_DELAY, and more than the 30 s (by default)
+after which Slurm kills a job that was cancelled."""
+PAUSES = (2.0, 8.0)
+"""Shortest and longest seconds between two questions; random, as many jobs may get their signal at the same time."""
 
 
 class Job(Checkpointable):
@@ -26,7 +36,7 @@ class Job(Checkpointable):
         # notes the signal, and ends with a checkpoint between two steps; what comes later must not disturb that.
         signum = signal.Signals[f"SIG{JobEnvironment.USR_SIG}"]
         requeue: Any = signal.signal(signum, lambda *_: None)
-        log = JobEnvironment().paths.stderr
+        log, before = JobEnvironment().paths.stderr, self._progress()
         sys.argv = ["run.py", *self.words]  # what info.json says of the command
         try:
             code = main(self.words)
@@ -34,7 +44,16 @@ class Job(Checkpointable):
             self.cell.note_end(1, log)
             raise
         if code > 128 and self._is_running():
-            requeue(signum, None)
+            # SIGTERM, with which Slurm preempts, may come at any moment; the other signal comes near the time limit.
+            if code == 128 + signum and self._progress() == before:
+                reason = "not requeued: no checkpoint between the start of the job and Slurm's signal (slurm.hours?)"
+                self.cell.note_end(code, log, reason)
+            else:
+                try:
+                    requeue(signum, None)
+                except Exception as error:
+                    self.cell.note_end(code, log, f"could not be requeued: {one_line(error)}")
+                    raise
         if code < 128:
             self.cell.note_end(code, log)
         if code not in (0, 3):
@@ -43,7 +62,16 @@ class Job(Checkpointable):
     def _is_running(self) -> bool:
         """Whether Slurm has not ended the job: the signal came before its time is over, or before it is preempted.
 
-        One that was cancelled is not running any more, and must not come back.
+        One that was cancelled is not running any more, and must not come back, which Slurm would allow. Where squeue
+        goes on not to answer, Slurm would have killed that one by now.
         """
-        job = JobEnvironment().job_id
-        return (slurm.queue([job]) or {}).get(job) == "RUNNING"
+        job, deadline = JobEnvironment().job_id, time.monotonic() + PATIENCE
+        while (states := slurm.queue([job], timeout=20.0)) is None:
+            if time.monotonic() >= deadline:
+                return True
+            time.sleep(random.uniform(*PAUSES))
+        return states.get(job) == "RUNNING"
+
+    def _progress(self) -> list[tuple[bool, int]]:
+        """How far each seed is, as a job would find it that starts now."""
+        return [(has_ended(folder), saved_step(folder)) for folder in self.cell.folders]

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from core.config import Config, ConfigError
-from sweep.cluster import queued_jobs, submit
+from sweep.cells import cell_of, job_states
+from sweep.cluster import submit
 from sweep.local import cores, run_queue
 from sweep.plan import describe_plan, make_plan, memory_warning
 from sweep.settings import Sweep
@@ -25,8 +26,9 @@ def launch(sweep: Sweep, cells: Sequence[tuple[Config, Config]], threads_given: 
         cells = [(replace(config, threads=threads), base) for config, base in cells]
     if on_slurm and cells[0][0].overwrite:
         raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
-    queued = queued_jobs(cells)
-    entries = make_plan(cells, queued or {})
+    if on_slurm:
+        _check_gpus(sweep, cells[0][0].device)
+    entries = make_plan(cells, job_states(cell_of(*cell) for cell in cells))
     if sweep.settings.dry:
         print(describe_plan(entries, jobs))
         return 0
@@ -37,3 +39,14 @@ def launch(sweep: Sweep, cells: Sequence[tuple[Config, Config]], threads_given: 
     if warning := memory_warning(entries, jobs):
         print(warning, file=sys.stderr)
     return run_queue(entries, jobs, check)
+
+
+def _check_gpus(sweep: Sweep, device: str) -> None:
+    """ConfigError where the jobs get GPUs that they do not use, or the other way round."""
+    gpus = sweep.slurm.gpus
+    # sbatch has other parameters that ask for GPUs, and some clusters want those.
+    asked = gpus or any(name.startswith(("gpus", "gres", "tres")) for name in sweep.sbatch)
+    if device != "cpu" and not asked:
+        raise ConfigError(f"device={device} with launcher=slurm needs slurm.gpus= of at least 1")
+    if device == "cpu" and gpus:
+        raise ConfigError(f"slurm.gpus={gpus} needs device=cuda: with device=cpu, the cells would not use them")

@@ -16,7 +16,7 @@ from pathlib import Path
 from core.interrupt import Interrupted
 from core.results import one_line
 from sweep.cells import command_words, format_seeds, reason_of
-from sweep.plan import Entry
+from sweep.plan import Entry, describe_state
 from sweep.progress import Display, End
 
 RUN = Path(__file__).parents[1] / "run.py"
@@ -77,8 +77,11 @@ class Queue:
 def run_queue(entries: Sequence[Entry], jobs: int, check: Callable[[], None]) -> int:
     """Train the cells that have not ended, `jobs` at a time in the given order; the exit code.
 
+    Those that another process or a Slurm job has, or may have, are left out.
     `check` raises Interrupted to end all: the processes write their checkpoints first.
     """
+    elsewhere = [entry for entry in entries if entry.state.name in ("running", "queued", "unknown")]
+    entries = [entry for entry in entries if entry not in elsewhere]
     waiting = [entry for entry in entries if entry.state.name != "finished"]
     for entry in waiting:
         log = entry.cell.record("log")
@@ -110,10 +113,18 @@ def run_queue(entries: Sequence[Entry], jobs: int, check: Callable[[], None]) ->
     for entry, end in display.failed.items():
         seeds = format_seeds(entry.cell.seeds)
         print(f"{entry.cell.name} seed={seeds} failed: {end.reason}\n    {entry.cell.record('log')}", file=sys.stderr)
+    if elsewhere:
+        first = elsewhere[0]
+        print(
+            f"{len(elsewhere)} left out, as others have them (`run.py status {first.cell.root}` shows all):"
+            f" {first.cell.name} seed={format_seeds(first.cell.seeds)} is {describe_state(first.state)}"
+            + (" ..." if len(elsewhere) > 1 else ""),
+            file=sys.stderr,
+        )
     if interrupted:
         print("interrupted; the same command resumes (without overwrite=true)", file=sys.stderr)
         raise interrupted
-    return 4 if display.failed else 3 if display.diverged else 0
+    return 4 if display.failed else 2 if elsewhere else 3 if display.diverged else 0
 
 
 def cores() -> int:

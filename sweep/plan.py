@@ -49,12 +49,15 @@ def make_plan(cells: Sequence[tuple[Config, Config]], jobs: Mapping[str, str]) -
     bases = {(base.env, base.algo): base for _, base in cells}
     runs, _ = read_results(cell_of(*cells[0]).root, {task for task, _ in bases}, {algo for _, algo in bases})
     factors = estimates.corrections(
-        (run, _config_of(run), bases[run.task, run.algo]) for run in runs if (run.task, run.algo) in bases
+        ((run, _config_of(run), bases[run.task, run.algo]) for run in runs if (run.task, run.algo) in bases),
+        cells[0][0].device,  # one command has one device
     )
     entries = []
     for config, base in cells:
         cell = cell_of(config, base)
-        state = State("new", detail="starts again") if config.overwrite else state_of(cell, jobs)
+        state = state_of(cell, jobs)
+        if config.overwrite and state.name not in ("running", "queued", "unknown"):
+            state = State("new", detail="starts again")
         entries.append(Entry(cell, config, base, state, estimates.correct(factors, config.env, config.algo)))
     return sorted(entries, key=lambda entry: -entry.remaining)
 

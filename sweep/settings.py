@@ -12,6 +12,8 @@ from core.config import Config, ConfigError, choose, override
 
 SLURM_PREFIX = "slurm."
 LAUNCHERS = ("local", "slurm")
+SIGNAL_DELAY = 120
+"""Seconds before the time limit at which Slurm tells a job: enough for a checkpoint of many seeds on a slow disk."""
 
 
 @dataclass
@@ -103,3 +105,9 @@ def _check(sweep: Sweep, slurm_keys: Sequence[str]) -> None:
             raise ConfigError(f"bad value {getattr(slurm, name)} for slurm.{name}: must be at least {least}")
     if not 0 < slurm.hours < float("inf"):
         raise ConfigError(f"bad value {slurm.hours} for slurm.hours: must be positive and finite")
+    if 3600 * slurm.hours <= 2 * SIGNAL_DELAY and "signal" not in sweep.sbatch:
+        # The signal would come before the training has come anywhere, again and again.
+        raise ConfigError(
+            f"bad value {slurm.hours} for slurm.hours: must be more than {2 * SIGNAL_DELAY} seconds, as a cell writes"
+            f" its checkpoint {SIGNAL_DELAY} seconds before the end, unless slurm.signal= says otherwise"
+        )

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from core.config import ConfigError, parse_seeds
 from core.results import find_runs, has_ended, read_settings
-from core.slurm import queue
 from plots.tables import Table, text_cells, to_terminal
-from sweep.cells import RECORDS, Cell, State, format_seeds, reached, shorten, state_of
+from sweep.cells import NO_ANSWER, RECORDS, Cell, State, format_seeds, job_states, reached, shorten, state_of
 from sweep.plan import count_states, describe_state, list_details
 
 
@@ -41,12 +40,11 @@ def describe_status(words: Sequence[str]) -> str:
     cells = find_cells(root)
     if not cells:
         raise ConfigError(f"no cells in {root} (looked for <task>/<algorithm>/seed=<n> in it)")
-    recorded = {job for cell in cells if (job := cell.read("job").get("job"))}
-    jobs = queue(recorded)
-    states = [state_of(cell, jobs or {}) for cell in cells]
+    jobs = job_states(cells)
+    states = [state_of(cell, jobs) for cell in cells]
     lines = [_table(cells, states), count_states(states), *list_details(cells, states)]
-    if jobs is None:
-        lines.append("(squeue does not answer: what is queued or running on the cluster may look interrupted)")
+    if NO_ANSWER in jobs.values():
+        lines.append("(squeue does not answer: which jobs are queued or running on the cluster is unknown)")
     return "\n".join(lines)
 
 

@@ -21,7 +21,7 @@ from core.interrupt import Interrupted, Interrupts
 from core.lock import LockedError, lock_owner, run_lock
 from core.results import find_runs
 from sweep import estimates
-from sweep.cells import Cell, cell_of, command_words, format_seeds, state_of
+from sweep.cells import Cell, cell_of, command_words, format_seeds, job_states, state_of
 from sweep.plan import make_plan
 from sweep.progress import Display, End
 from sweep.settings import parse_sweep
@@ -76,6 +76,7 @@ def test_settings_of_a_sweep_are_no_settings_of_its_runs():
     assert (sweep.slurm.hours, sweep.slurm.cpus, sweep.slurm.gpus) == (1.5, 4, 0)
     assert sweep.sbatch == {"account": "me", "mail-type": "END"} and left == ["algo=SRad", "env=W+M"]
     assert not parse_sweep(["algo=SRad", "env=W+M"])[0].wanted
+    parse_sweep(["launcher=slurm", "slurm.hours=0.03", "slurm.signal=USR2@30"])
 
 
 @pytest.mark.parametrize(
@@ -95,8 +96,13 @@ def test_settings_of_a_sweep_are_no_settings_of_its_runs():
         ("launcher=slurm slurm.cpus=x", "bad value 'x' for slurm.cpus: expected int"),
         ("launcher=slurm slurm.cpus=0", "bad value 0 for slurm.cpus: must be at least 1"),
         ("launcher=slurm slurm.hours=0", "bad value 0.0 for slurm.hours"),
+        ("launcher=slurm slurm.hours=0.06", "bad value 0.06 for slurm.hours: must be more than 240 seconds"),
         ("launcher=slurm slurm.hours=nan", "bad value nan for slurm.hours"),
         ("launcher=slurm slurm.=1", "expected key=value"),
+        ("launcher=slurm device=cuda", "device=cuda with launcher=slurm needs slurm.gpus= of at least 1"),
+        ("launcher=slurm slurm.gpus=2", "slurm.gpus=2 needs device=cuda"),
+        ("launcher=slurm slurm.gpus=1 device=gpu", "bad value 'gpu' for device: must be cpu, cuda or cuda:N"),
+        ("device=cuda:", "bad value 'cuda:' for device: must be cpu, cuda or cuda:N"),
         ("launcher=slurm overwrite=true", "overwrite=true does not go with launcher=slurm"),
         ("jobs=2 slurm.cpus=2", "slurm.cpus= needs launcher=slurm"),
         ("jobs=2 seed=1-0", "is empty"),
@@ -193,6 +199,15 @@ def test_finished_runs_correct_the_estimates(tmp_path):
     assert after.pop("DPre R+N") == 0 and before.pop("DPre R+N") > 0
     for name, seconds in after.items():
         assert seconds == pytest.approx(3.0 * before[name])
+    (folder / "result.json").write_text(json.dumps({"return_mean": 1.0, "seeds_in_lockstep": 1}))
+    after = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
+    assert {name: after[name] for name in before} == before
+    (folder / "result.json").write_text(json.dumps(result))
+    (folder / "config.yaml").write_text((folder / "config.yaml").read_text() + "device: cuda:0\n")
+    after = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
+    assert {name: after[name] for name in before} == before
+    after = {entry.cell.name: entry.remaining for entry in plan_of(f"{words} device=cuda", tmp_path)}
+    assert after["DRad R+N"] == pytest.approx(3.0 * before["DRad R+N"])
 
 
 def test_the_time_left_follows_the_pace_so_far(tmp_path):
@@ -285,6 +300,23 @@ def test_a_killed_process_and_a_diverging_seed_leave_the_others_alone(tmp_path):
     assert "seed 3: failed at step" in state_of(next(c for c in find_cells(tmp_path) if "DPre" in c.variant), {}).detail
 
 
+def test_cells_that_others_have_are_left_out(tmp_path, monkeypatch, capsys):
+    words = [*f"algo=DPre,SRad,NFW env=R+N seed=3 {SHORT} jobs=1 threads=1".split(), f"results={tmp_path / 'results'}"]
+    cells = {e.config.algo: e.cell for e in plan_of(f"algo=DPre,SRad,NFW env=R+N seed=3 {SHORT}", tmp_path / "results")}
+    fake(tmp_path, monkeypatch, squeue="echo 7 PENDING")
+    cells["SRad"].write("job", {"job": "7", "log": "x"})
+    lock = cells["NFW"].folders[0].with_name("seed=3.lock")
+    lock.parent.mkdir(parents=True)
+    lock.write_text(json.dumps({"pid": 7, "host": "elsewhere"}))
+    for more in ([], ["overwrite=true"]):
+        assert run.main([*words, *more]) == 2
+        captured = capsys.readouterr()
+        assert "1 of 1 cells done" in captured.out and "failed" not in captured.err
+        (line,) = [line for line in captured.err.splitlines() if "left out" in line]
+        assert line.startswith("2 left out, as others have them") and (": job 7" in line or "on elsewhere" in line)
+        assert not cells["SRad"].record("log").exists() and not cells["NFW"].record("log").exists()
+
+
 # ---------------------------------------------------------------- states
 
 
@@ -319,6 +351,13 @@ def test_states(tmp_path):
     assert state_of(cell, {}).detail == f"run.py: the reason (log: {log})"
     cell.note_end(-9, log)
     assert "killed by SIGKILL" in state_of(cell, {}).detail
+    info, end = cell.folders[0] / "info.json", cell.record("end")
+    info.touch()
+    os.utime(info, ns=(0, end.stat().st_mtime_ns - 1))
+    assert state_of(cell, {}).name == "failed"
+    os.utime(info, ns=(0, end.stat().st_mtime_ns + 1))  # a run.py of its own, after that
+    assert (state_of(cell, {}).name, state_of(cell, {}).step) == ("interrupted", 40)
+    info.unlink()
     lock = cell.folders[0].with_name("seed=0.lock")
     lock.write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
     running = state_of(cell, {})
@@ -347,7 +386,9 @@ def test_status_of_a_folder(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert run.main(["status", str(root)]) == 0
     out = capsys.readouterr().out
-    assert "3 cells: 1 new, 1 finished, 1 interrupted" in out and "300/900" in out and "squeue does not answer" in out
+    assert (
+        "3 cells: 1 unknown, 1 finished, 1 interrupted" in out and "300/900" in out and "squeue does not answer" in out
+    )
     fake(tmp_path, monkeypatch, squeue="echo 7_0 PENDING")
     assert run.main(["status", str(root)]) == 0
     out = capsys.readouterr().out
@@ -369,6 +410,8 @@ def test_jobs_that_slurm_knows(tmp_path, monkeypatch):
     assert slurm.queue([]) == {}
     fake(tmp_path, monkeypatch, squeue='echo "$@" >&2; echo 7_0 RUNNING; echo 7_1 PENDING; echo 8 COMPLETING')
     assert slurm.queue(["7_1", "8", "9_0"]) == {"7_1": "PENDING", "8": "COMPLETING"}
+    fake(tmp_path, monkeypatch, squeue='case "$*" in *--states=all*) echo 7_0 SUSPENDED; echo 7_1 TIMEOUT;; esac')
+    assert slurm.queue(["7_0", "7_1"]) == {"7_0": "SUSPENDED"}
     fake(tmp_path, monkeypatch, squeue="echo slurm_load_jobs error: Invalid job id specified >&2; exit 1")
     assert slurm.queue(["7_1"]) == {}
     fake(tmp_path, monkeypatch, squeue="echo Unable to contact slurm controller >&2; exit 1")
@@ -381,7 +424,11 @@ def test_jobs_that_slurm_knows(tmp_path, monkeypatch):
     "squeue, here, taken",
     [
         ("echo 7_1 RUNNING", {}, False),  # the job goes on elsewhere
+        ("echo 7_1 SUSPENDED", {}, False),
+        ("echo 7_1 CANCELLED", {}, True),
         ("echo 7_0 RUNNING", {}, True),  # its neighbour in the array does
+        ("", {"SLURM_CLUSTER_NAME": "small"}, False),  # we ask another cluster
+        ("", {"SLURM_CLUSTERS": "small"}, False),
         ("exit 1", {}, False),  # nobody knows
         ("exit 1", {"SLURM_ARRAY_TASK_ID": "1", "SLURM_RESTART_COUNT": "1"}, True),  # we are its next incarnation
         ("exit 1", {"SLURM_ARRAY_TASK_ID": "1"}, False),  # we are a step of the same incarnation
@@ -389,8 +436,8 @@ def test_jobs_that_slurm_knows(tmp_path, monkeypatch):
     ],
 )
 def test_the_lock_of_a_job_on_a_node_that_died_is_taken_over(tmp_path, monkeypatch, squeue, here, taken):
-    fake(tmp_path, monkeypatch, squeue=squeue)
-    for name in ("SLURM_JOB_ID", "SLURM_ARRAY_JOB_ID", "SLURM_CLUSTER_NAME", "SLURM_RESTART_COUNT"):
+    fake(tmp_path, monkeypatch, squeue=squeue, scontrol="echo 'ClusterName             = big'")
+    for name in ("SLURM_JOB_ID", "SLURM_ARRAY_JOB_ID", "SLURM_CLUSTER_NAME", "SLURM_CLUSTERS", "SLURM_RESTART_COUNT"):
         monkeypatch.delenv(name, raising=False)
     lock = tmp_path / "seed=1.lock"
     job = {"cluster": "big", "id": "7_1", "restarts": 0}
@@ -407,6 +454,17 @@ def test_the_lock_of_a_job_on_a_node_that_died_is_taken_over(tmp_path, monkeypat
     with run_lock(tmp_path / "seed=1"):
         owner = json.loads(lock.read_text())
         assert owner["pid"] == os.getpid() and owner.get("job", {}).get("restarts") == (1 if here else None)
+
+
+def test_a_lock_that_another_host_takes_over_while_slurm_is_asked_is_left_to_it(tmp_path, monkeypatch):
+    lock, other = tmp_path / "seed=1.lock", tmp_path / "other"
+    job = {"cluster": "big", "id": "7_1", "restarts": 0}
+    lock.write_text(json.dumps({"pid": 7, "host": "node-12", "job": job}))
+    other.write_text(json.dumps({"pid": 8, "host": "node-13"}))
+    fake(tmp_path, monkeypatch, squeue=f"cat {other} > {lock}")
+    monkeypatch.setenv("SLURM_CLUSTERS", "big")
+    with pytest.raises(LockedError, match="by process 8 on node-13"):
+        run_lock(tmp_path / "seed=1").__enter__()
 
 
 @pytest.mark.parametrize("signum", [signal.SIGUSR1, signal.SIGUSR2])
@@ -437,8 +495,11 @@ def cluster(tmp_path, monkeypatch):
     (tmp_path / "queue").write_text("")
     number = f'n=$(($(cat {tmp_path}/n 2>/dev/null || echo 40) + 1)); echo $n > {tmp_path}/n; cp "$1" {tmp_path}/$n.sh'
     fake(
-        tmp_path, monkeypatch, srun="", squeue=f"cat {tmp_path}/queue", sbatch=f"{number}; echo Submitted batch job $n"
-    )
+        tmp_path, monkeypatch, srun="", squeue=f"cat {tmp_path}/queue", sbatch=f"{number}; echo Submitted batch job $n",
+        scontrol="echo 'ClusterName             = big'",
+    )  # fmt: skip
+    for name in ("SLURM_CLUSTERS", "SLURM_CLUSTER_NAME", "SBATCH_CLUSTERS"):
+        monkeypatch.delenv(name, raising=False)
     return tmp_path
 
 
@@ -450,6 +511,7 @@ def test_only_what_is_neither_finished_nor_queued_is_submitted(cluster, capsys):
             "slurm.hours=2.5",
             "slurm.cpus=3",
             "slurm.gpus=1",
+            "device=cuda",
             "slurm.parallel=4",
             "slurm.account=me",
             "slurm.exclusive=true",
@@ -481,6 +543,38 @@ def test_only_what_is_neither_finished_nor_queued_is_submitted(cluster, capsys):
     assert len(list(root.glob("*/*/seed=*/result.json"))) == 2
 
 
+def test_a_job_of_another_cluster_is_not_taken_for_gone(cluster, monkeypatch, capsys):
+    words = ["algo=DPre", "env=R+N", f"results={cluster / 'results'}"]
+    assert run.main([*words, "launcher=slurm"]) == 0
+    (cell,) = find_cells_of(cluster)
+    assert cell.read("job")["cluster"] == "big"
+    assert state_of(cell, job_states([cell])).name == "new"  # it is over
+    monkeypatch.setenv("SLURM_CLUSTER_NAME", "small")
+    (cluster / "queue").write_text("41 RUNNING\n")  # another job of that number
+    capsys.readouterr()
+    assert run.main([*words, "launcher=slurm"]) == 0
+    said = f"Slurm does not tell here of job 41 of cluster big; if that is over, delete {cell.record('job')}"
+    out = capsys.readouterr().out
+    assert f"DPre R+N is not submitted: {said}" in out and "nothing to submit" in out
+    assert not (cluster / "42.sh").exists()
+    assert run.main(["status", str(cluster / "results")]) == 0
+    out = capsys.readouterr().out
+    assert "1 cell: 1 unknown" in out and said in out
+    cell.note_end(2, cluster / "log")  # the job itself has said that it is over
+    assert state_of(cell, job_states([cell])).name == "failed"
+    assert run.main([*words, "launcher=slurm", "slurm.clusters=huge"]) == 0
+    assert cell.read("job")["cluster"] == "huge"
+
+
+def test_a_submission_that_another_host_left_open_names_its_lock(cluster, capsys):
+    lock = cluster / "results" / "sweep" / "submission.lock"
+    lock.parent.mkdir(parents=True)
+    lock.write_text(json.dumps({"pid": 7, "host": "elsewhere"}))
+    assert run.main(["algo=DPre", "env=R+N", "launcher=slurm", f"results={cluster / 'results'}"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and f"by process 7 on elsewhere; if that has ended, delete {lock}" in err
+
+
 def test_what_sbatch_refuses_is_said_in_one_line(cluster, monkeypatch, capsys):
     words = ["algo=DPre", "env=R+N", "launcher=slurm", f"results={cluster / 'results'}"]
     fake(cluster, monkeypatch, sbatch="echo 'sbatch: error: invalid partition specified: x' >&2; exit 1")
@@ -496,6 +590,73 @@ def test_what_sbatch_refuses_is_said_in_one_line(cluster, monkeypatch, capsys):
     next(iter(find_cells_of(cluster))).write("job", {"job": "41", "log": "x"})
     assert run.main(words) == 2
     assert "squeue does not answer" in capsys.readouterr().err
+
+
+@pytest.fixture
+def job(cluster, monkeypatch):
+    """A job of a cell, which `end(code, step)` lets train up to a checkpoint of that step and end."""
+    from sweep import job as module
+
+    (cluster / "queue").write_text("41 RUNNING\n")
+    fake(cluster, monkeypatch, scontrol=f'echo "$@" >> {cluster}/scontrol')
+    for name in ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in {"SUBMITIT_EXECUTOR": "slurm", "SUBMITIT_FOLDER": str(cluster), "SLURM_JOB_ID": "41"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(module, "PATIENCE", 0.2)
+    monkeypatch.setattr(module, "PAUSES", (0.01, 0.02))
+    (cell,) = find_cells_of(cluster)
+    previous = signal.signal(signal.SIGUSR2, lambda *_: subprocess.check_call(["scontrol", "requeue", "41"]))
+
+    def end(code, step):
+        def main(words):
+            (cell.folders[0] / "checkpoint").mkdir(parents=True, exist_ok=True)
+            (cell.folders[0] / "checkpoint" / f"replay-0-{step}.f32").touch()
+            return code
+
+        monkeypatch.setattr(run, "main", main)
+        with pytest.raises((SystemExit, subprocess.CalledProcessError)):
+            module.Job(["words"], cell)()
+        signal.signal(signal.SIGUSR2, lambda *_: subprocess.check_call(["scontrol", "requeue", "41"]))
+        requeued = (cluster / "scontrol").exists()
+        (cluster / "scontrol").unlink(missing_ok=True)
+        return requeued
+
+    end.cell = cell
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "argv", sys.argv)
+        yield end
+    signal.signal(signal.SIGUSR2, previous)
+
+
+USR2, TERM = 128 + signal.SIGUSR2, 128 + signal.SIGTERM
+
+
+def test_a_job_requeues_itself_unless_it_was_cancelled(cluster, monkeypatch, job):
+    assert job(USR2, 20) and job(TERM, 30) and not job.cell.record("end").exists()
+    for queue in ("41 COMPLETING\n", "41 CANCELLED\n", ""):
+        (cluster / "queue").write_text(queue)
+        assert not job(TERM, 40)
+    assert not job.cell.record("end").exists()
+    once = f"[ -e {cluster}/asked ] && echo 41 COMPLETING || {{ touch {cluster}/asked; exit 1; }}"
+    fake(cluster, monkeypatch, squeue=once)  # does not answer at first
+    assert not job(TERM, 50)
+    fake(cluster, monkeypatch, squeue="exit 1")
+    assert job(TERM, 60)
+
+
+def test_a_job_that_cannot_be_requeued_says_so(cluster, monkeypatch, job):
+    fake(cluster, monkeypatch, scontrol="exit 1")
+    job(USR2, 20)
+    state = state_of(job.cell, {})
+    assert state.name == "failed" and "could not be requeued: " in state.detail and "scontrol" in state.detail
+
+
+def test_a_job_without_a_checkpoint_before_its_time_limit_is_not_requeued_for_ever(job):
+    assert job(USR2, 20) and not job(USR2, 20)
+    state = state_of(job.cell, {})
+    assert state.name == "failed" and "not requeued: no checkpoint between" in state.detail
+    assert job(TERM, 20)  # preempted at once
 
 
 def find_cells_of(cluster):

@@ -5,10 +5,10 @@
     python bench/runtime.py seeds=10                               # ten seeds in lockstep: seconds of all ten
     python bench/runtime.py algo=DRad,SRad,DOpt,NFW device=cuda    # networks and replay buffer on a GPU
 
-A trial fills a replay buffer with 1,000 steps of the environment under random feasible actions, makes a new agent with
-the paper's hyperparameters but for the batch size, and takes `steps` gradient steps, sampling included. Every trial
-has seeds of its own. All cells are measured once before any is measured again, and every measurement is saved when it
-is made, so that what an interruption leaves is of use.
+A trial fills replay buffers with 1,000 steps of the environment under random feasible actions, makes new agents with
+the paper's hyperparameters but for the batch size, and has them take `steps` gradient steps, sampling included. Of one
+batch size, the algorithms take turns of 50 steps, so that a machine that is slow for a while is so for all. Every trial
+has seeds of its own, and every batch size is saved when it is measured, so that what an interruption leaves is of use.
 
 Prints a table and saves `out`/runtime.csv (default bench/results), a row a measurement, which `python plot.py runtime`
 draws. CPU seconds are CPU time of the process, on one thread, so that other load on the machine does not count. With a
@@ -20,11 +20,12 @@ they hardly count, and the time of one step times 9e5 is that of the gradient st
 from __future__ import annotations
 
 import csv
+import math
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
-from itertools import product
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -39,12 +40,13 @@ from algos import ALGORITHMS
 from bench.common import TASK, fill_replay, machine, make_agent, parse_options, positive, positives
 from core.config import ConfigError, split_names
 from core.graph import GradientSteps
-from core.replay import Replay
 from plots.runtime import COLUMNS, runtime_table
 from plots.tables import to_terminal
 
 FILL = 1_000
 """Transitions of each seed in the replay buffer."""
+TURN = 50
+"""Gradient steps that an algorithm takes before the next one has its turn."""
 DEFAULTS = {
     "algo": "all",
     "batch": "1,16,100,256",
@@ -56,23 +58,29 @@ DEFAULTS = {
 }
 
 
-def measure(name: str, batch: int, replay: Replay, seeds: Sequence[int], steps: int) -> tuple[float, float]:
-    """CPU and GPU seconds of the first `steps` gradient steps."""
-    agent = make_agent(name, batch, seeds, replay.rows.device)
-    take_gradient_step = GradientSteps(agent, replay, batch)
+def measure(agents: Mapping[str, GradientSteps], steps: int, progress: Callable[[], None]) -> dict[str, tuple]:
+    """CPU and GPU seconds of the first `steps` gradient steps of each, in turns, after each of which is `progress`."""
 
-    def train() -> None:
-        for _ in range(steps):
+    def train(take_gradient_step: GradientSteps, count: int) -> None:
+        for _ in range(count):
             take_gradient_step()
-        if agent.device.type == "cuda":
-            torch.cuda.synchronize(agent.device)
+        if take_gradient_step.agent.device.type == "cuda":
+            torch.cuda.synchronize(take_gradient_step.agent.device)
 
-    clock = time.process_time if agent.device.type == "cpu" else time.perf_counter
-    start = clock()
-    train()
-    seconds = clock() - start
-    gpu = kernel_seconds(train) if agent.device.type == "cuda" else 0.0
-    return max(seconds - gpu, 0.0), gpu
+    seconds = dict.fromkeys(agents, 0.0)
+    for done in range(0, steps, TURN):
+        for name, steps_of in agents.items():
+            clock = time.process_time if steps_of.agent.device.type == "cpu" else time.perf_counter
+            start = clock()
+            train(steps_of, min(TURN, steps - done))
+            seconds[name] += clock() - start
+            progress()
+    found = {}
+    for name, steps_of in agents.items():
+        on_gpu = steps_of.agent.device.type == "cuda"
+        gpu = kernel_seconds(partial(train, steps_of, steps)) if on_gpu else 0.0
+        found[name] = max(seconds[name] - gpu, 0.0), gpu
+    return found
 
 
 def kernel_seconds(call: Callable[[], None]) -> float:
@@ -97,20 +105,23 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], list[int], dic
 def run_trials(names: Sequence[str], batches: Sequence[int], counts: dict[str, int], device: str, path: Path) -> None:
     """Measure every cell `trials` times and write each measurement to `path` at once."""
     fixed = {"task": TASK, "seeds": counts["seeds"], "steps": counts["steps"], "machine": machine(torch.device(device))}
-    total = counts["trials"] * len(names) * len(batches)
-    with open(path, "w", newline="", encoding="utf-8") as file, tqdm(total=total, unit="cell", smoothing=0) as bar:
+    turns = counts["trials"] * len(names) * len(batches) * math.ceil(counts["steps"] / TURN)
+    with open(path, "w", newline="", encoding="utf-8") as file, tqdm(total=turns, unit="turn", smoothing=0) as bar:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        for trial, name in product(range(counts["trials"]), names):
+        for trial in range(counts["trials"]):
             seeds = range(trial * counts["seeds"], (trial + 1) * counts["seeds"])
-            replay = fill_replay(make_agent(name, batches[0], seeds, device), FILL)
+            replays = {name: fill_replay(make_agent(name, batches[0], seeds, device), FILL) for name in names}
             for batch in batches:
-                bar.set_description(f"{name}, batch {batch}, trial {trial + 1}")
-                cpu, gpu = measure(name, batch, replay, seeds, counts["steps"])
-                row = {"algo": name, "batch": batch, "trial": trial, "cpu_seconds": cpu, "gpu_seconds": gpu}
-                writer.writerow(fixed | row)
+                bar.set_description(f"batch {batch}, trial {trial + 1}")
+                agents = {
+                    name: GradientSteps(make_agent(name, batch, seeds, device), replay, batch)
+                    for name, replay in replays.items()
+                }
+                for name, (cpu, gpu) in measure(agents, counts["steps"], bar.update).items():
+                    row = {"algo": name, "batch": batch, "trial": trial, "cpu_seconds": cpu, "gpu_seconds": gpu}
+                    writer.writerow(fixed | row)
                 file.flush()
-                bar.update()
 
 
 def main(arguments: list[str]) -> int:

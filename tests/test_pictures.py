@@ -164,7 +164,7 @@ def test_runtime_from_measurement_to_bars(bench, tmp_path, capsys):
     assert [line.split()[0] for line in printed.splitlines() if "±" in line] == ["DPre", "SRad"]
     records = runtime.read_runtime(tmp_path / "runtime.csv")
     cells = [(r["trial"], r["algo"], r["batch"]) for r in records]
-    assert cells == [(t, algo, b) for t in (0, 1) for algo in ("DPre", "SRad") for b in (2, 16)]
+    assert cells == [(t, algo, b) for t in (0, 1) for b in (2, 16) for algo in ("DPre", "SRad")]
     assert all(r["cpu_seconds"] > 0 and r["gpu_seconds"] == 0 and r["task"] == "HC+O" for r in records)
     assert plot.main(["runtime", str(tmp_path / "runtime.csv"), f"out={tmp_path}"]) == 0
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"runtime.png", "runtime.pdf"}
@@ -183,7 +183,7 @@ def test_the_replay_buffer_holds_real_steps(bench):
 
 
 def test_an_interrupted_measurement_is_of_use(bench, tmp_path, capsys, monkeypatch):
-    times = iter([(1.0, 0.25), (2.0, 0.5)])
+    times = iter([{"DPro": (1.0, 0.25), "DRad": (2.0, 0.5)}])
 
     def measure(*arguments):
         try:

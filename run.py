@@ -317,6 +317,8 @@ def main(arguments: list[str]) -> int:
             sweep, words = parse_sweep(arguments)
             cells = plan(words)
             if sweep.wanted:
+                if sweep.settings.launcher == "local":
+                    check_device(cells[0][0].device)
                 threads_given = any(word.startswith("threads=") for word in words)
                 return launch(sweep, cells, threads_given, interrupts.check)
             done = [train(config, base, interrupts.check) for config, base in cells]

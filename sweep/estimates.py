@@ -90,11 +90,15 @@ def memory(config: Config, seeds: int) -> float:
     return PROCESS_BYTES + seeds * (SEED_BYTES + simulators + 4.0 * width * min(config.buffer_size, config.steps))
 
 
+TELLING_STEPS = 10_000
+"""Gradient steps from which on a run's time says something of the rates."""
+
+
 def corrections(runs: Iterable[tuple[Run, Config, Config]], device: str) -> dict[tuple[str, str], float]:
     """By (task, algorithm), how many times as long as estimated finished runs took; ("", "") has the median of all.
 
-    Each run comes with its configuration and the paper's of the same cell. Those on another kind of `device` are left
-    out, and those whose result does not have its time.
+    Each run comes with its configuration and the paper's of the same cell. Left out are those on another kind of
+    `device`, with other layers, or too short to tell, and those whose result does not have its time.
     """
     ratios: dict[tuple[str, str], list[float]] = {}
     for run, config, base in runs:
@@ -102,7 +106,10 @@ def corrections(runs: Iterable[tuple[Run, Config, Config]], device: str) -> dict
             continue
         try:
             took, seeds = float(run.result["seconds"]["total"]), int(run.result["seeds_in_lockstep"])
+            steps = int(run.result["gradient_steps"])
         except (KeyError, TypeError, ValueError):
+            continue
+        if config.hidden != base.hidden or steps < TELLING_STEPS:
             continue
         ratio = took / seconds(config, base, seeds)
         ratios.setdefault((run.task, run.algo), []).append(ratio)

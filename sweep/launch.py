@@ -48,5 +48,9 @@ def _check_gpus(sweep: Sweep, device: str) -> None:
     asked = gpus or any(name.startswith(("gpus", "gres", "tres")) for name in sweep.sbatch)
     if device != "cpu" and not asked:
         raise ConfigError(f"device={device} with launcher=slurm needs slurm.gpus= of at least 1")
+    if ":" in device:
+        raise ConfigError(
+            f"device={device} does not go with launcher=slurm: a job sees its own GPUs alone (device=cuda)"
+        )
     if device == "cpu" and gpus:
         raise ConfigError(f"slurm.gpus={gpus} needs device=cuda: with device=cpu, the cells would not use them")

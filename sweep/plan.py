@@ -96,6 +96,9 @@ def describe_plan(entries: Sequence[Entry], jobs: int) -> str:
     lines += list_details([entry.cell for entry in entries], states)
     if left:
         memory = sum(sorted((entry.memory for entry in left), reverse=True)[:jobs])
+        jobs = min(jobs, len(left))
+        if left[0].config.device != "cpu":
+            lines.append("note: the estimates are for the CPU; GPUs are not measured")
         lines.append(
             f"estimate: {estimates.in_words(sum(work))} on one core in all;"
             f" {estimates.in_words(estimates.makespan(work, jobs))} with {jobs} cell{'s' * (jobs > 1)} at a time,"

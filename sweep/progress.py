@@ -40,7 +40,7 @@ class Display:
     def __enter__(self) -> Display:
         count = 1 + min(self.jobs, len(self.entries) - len(self.done)) if self.terminal else 0
         self.bars = [tqdm(total=1.0, position=i, bar_format=BAR, leave=False) for i in range(count)]
-        self.say(f"{len(self.entries)} cells, {len(self.done)} of them finished already; {self.jobs} at a time")
+        self.say(f"cells: {len(self.entries)}, finished already: {len(self.done)}, at a time: {self.jobs}")
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -183,6 +183,12 @@ def test_times_in_words():
     ]  # fmt: skip
 
 
+def after_a_run_of(steps, result, folder, words, root, before):
+    """Whether a finished run of so many gradient steps changes the estimate of another cell."""
+    (folder / "result.json").write_text(json.dumps(result | {"gradient_steps": steps}))
+    return {e.cell.name: e.remaining for e in plan_of(words, root)}["DRad R+N"] != before["DRad R+N"]
+
+
 def test_finished_runs_correct_the_estimates(tmp_path):
     words = "algo=DPre,DRad,SRad env=R+N,R+L2 seed=0"
     before = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
@@ -194,6 +200,9 @@ def test_finished_runs_correct_the_estimates(tmp_path):
     config, base = run.plan(["algo=DPre", "env=R+N", "seed=0"])[0]
     took = 3.0 * estimates.seconds(run.Config("DPre", "R+N", steps=300_000), base, 1)
     result = {"return_mean": 1.0, "seeds_in_lockstep": 1, "seconds": {"total": took}}
+    for steps in (estimates.TELLING_STEPS - 1, estimates.TELLING_STEPS):
+        assert after_a_run_of(steps, result, folder, words, tmp_path, before) == (steps >= estimates.TELLING_STEPS)
+    result["gradient_steps"] = 200_000
     (folder / "result.json").write_text(json.dumps(result))
     after = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
     assert after.pop("DPre R+N") == 0 and before.pop("DPre R+N") > 0
@@ -203,7 +212,11 @@ def test_finished_runs_correct_the_estimates(tmp_path):
     after = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
     assert {name: after[name] for name in before} == before
     (folder / "result.json").write_text(json.dumps(result))
-    (folder / "config.yaml").write_text((folder / "config.yaml").read_text() + "device: cuda:0\n")
+    config_text = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(config_text + "hidden: [16, 16]\n")
+    after = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
+    assert {name: after[name] for name in before} == before
+    (folder / "config.yaml").write_text(config_text + "device: cuda:0\n")
     after = {entry.cell.name: entry.remaining for entry in plan_of(words, tmp_path)}
     assert {name: after[name] for name in before} == before
     after = {entry.cell.name: entry.remaining for entry in plan_of(f"{words} device=cuda", tmp_path)}
@@ -257,7 +270,7 @@ def test_a_cell_that_fails_is_reported_and_the_others_are_carried_on(tmp_path):
     lock.rmdir()
     again = start(words, tmp_path)
     out, err = again.communicate(timeout=240)
-    assert again.returncode == 0 and "2 cells, 1 of them finished already" in err and "2 of 2 cells done" in out
+    assert again.returncode == 0 and "cells: 2, finished already: 1" in err and "2 of 2 cells done" in out
     assert not broken.record("end").exists() and done.record("log").read_text().count("+ ") == 1
     whole = tmp_path / "whole"
     assert run.main([*words.replace("jobs=2", "threads=1").split(), f"results={whole}"]) == 0

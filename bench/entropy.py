@@ -1,0 +1,139 @@
+"""How much entropy a policy can have on each task, beside the target that SAC steers for.
+
+    python bench/entropy.py                                # all tasks
+    python bench/entropy.py task=R+L2,R+T states=256       # two of them, at more states
+
+Prints a table and saves it in `out` (default bench/results) as entropy.md. For each task, means over `states` that a
+run's warm-up visits:
+
+- target: SAC's, -d.
+- uniform: the entropy of the uniform distribution on the feasible set, the log of its volume. No policy has more.
+- SRad, SAlpha: the most that N(mean, diag std^2) has after the map, in the measure of `entropy=paper`; found by
+  gradient ascent on mean and std in each state, and measured with noise that the ascent has not seen.
+- SRad ball, SAlpha ball: the same in the measure of `entropy=ball`.
+
+A target above what the map can reach makes the temperature rise without end; one just below keeps the policy as random
+as it can be.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+# This folder is first in the path, but the project's packages are looked for.
+sys.path[0] = str(Path(__file__).resolve().parents[1])
+
+import torch
+from scipy.stats import qmc
+from torch import Tensor
+from tqdm import tqdm
+
+import envs
+from bench.common import parse_options, positive
+from constraints import Constraint
+from core.config import ConfigError, split_names
+
+DIRECTIONS, SAMPLES, FRESH_SAMPLES, ASCENT_STEPS, RATE = 2**14, 256, 2**12, 300, 0.05
+MAPS = {
+    "SRad": ("radial", False),
+    "SAlpha": ("alpha", False),
+    "SRad ball": ("radial", True),
+    "SAlpha ball": ("alpha", True),
+}
+
+
+def visited_states(task: str, states: int) -> Tensor:
+    """Observations (states, n), twenty steps of uniform actions, projected, apart."""
+    env = envs.make(task, project=True)
+    env.action_space.seed(0)
+    obs, _ = env.reset(seed=0)
+    visited = []
+    for step in range(20 * states):
+        if step % 20 == 0:
+            visited.append(torch.as_tensor(obs))
+        obs, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            obs, _ = env.reset()
+    env.close()
+    return torch.stack(visited).double()
+
+
+def normal_noise(samples: int, dim: int, seed: int) -> Tensor:
+    """Standard normal numbers (samples, dim), more even than random ones."""
+    return torch.as_tensor(qmc.MultivariateNormalQMC([0.0] * dim, rng=seed).random(samples))
+
+
+def uniform_entropy(constraint: Constraint, obs: Tensor) -> Tensor:
+    """Log of the set's volume in every state: the unit ball's, times the mean of reach^d over all directions."""
+    dim = constraint.dim
+    directions = torch.nn.functional.normalize(normal_noise(DIRECTIONS, dim, seed=0), dim=-1)
+    log_reach = torch.stack([-constraint.gauge(o, directions, constraint.center(o)).log() for o in obs])
+    log_unit_ball = dim / 2 * math.log(math.pi) - math.lgamma(dim / 2 + 1)
+    return log_unit_ball + torch.logsumexp(dim * log_reach, -1) - math.log(DIRECTIONS)
+
+
+def policy_entropy(
+    constraint: Constraint, obs: Tensor, mean: Tensor, log_std: Tensor, noise: Tensor, mapping: str, unit_ball: bool
+) -> Tensor:
+    """Entropy in every state of N(mean, diag std^2) (states, d) after the map."""
+    action = mean + log_std.exp() * noise.unsqueeze(1)
+    ray = constraint.ray(obs, action, constraint.center(obs))
+    if mapping == "alpha":
+        return -ray.alpha_log_prob(mean, log_std.exp(), unit_ball).mean(0)
+    log_prob = torch.distributions.Normal(mean, log_std.exp()).log_prob(action).sum(-1)
+    return -ray.radial_log_prob(log_prob, unit_ball).mean(0)
+
+
+def largest_entropy(constraint: Constraint, obs: Tensor, mapping: str, unit_ball: bool) -> Tensor:
+    """The most entropy in every state that a Gaussian with independent coordinates has after the map."""
+    dim, center = constraint.dim, constraint.center(obs)
+    noise = normal_noise(SAMPLES, dim, seed=1)
+    reach = torch.stack([1 / constraint.gauge(obs, axis, center) for axis in torch.eye(dim).double()], -1)
+    mean = (center + 0.1 * reach).requires_grad_()  # not the centre itself, which may be a saddle point
+    log_std = reach.log().requires_grad_()
+    optimizer = torch.optim.Adam([mean, log_std], RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, ASCENT_STEPS)
+    for _ in range(ASCENT_STEPS):
+        optimizer.zero_grad()
+        (-policy_entropy(constraint, obs, mean, log_std, noise, mapping, unit_ball).sum()).backward()
+        optimizer.step()
+        schedule.step()
+    with torch.no_grad():
+        fresh = normal_noise(FRESH_SAMPLES, dim, seed=2)
+        return policy_entropy(constraint, obs, mean, log_std, fresh, mapping, unit_ball)
+
+
+def measure(task: str, states: int) -> list[str]:
+    """A row of the table."""
+    constraint = envs.constraint(task)
+    obs = visited_states(task, states)
+    entropies = [uniform_entropy(constraint, obs)]
+    entropies += [largest_entropy(constraint, obs, mapping, unit_ball) for mapping, unit_ball in MAPS.values()]
+    return [task, f"{-constraint.dim}", *(f"{entropy.mean():.2f}" for entropy in entropies)]
+
+
+def main(arguments: list[str]) -> int:
+    """Exit code: 0 done, 2 bad input."""
+    try:
+        options = parse_options(arguments, {"task": "all", "states": "64", "out": "bench/results"})
+        states = positive("states", options["states"])
+        tasks = split_names("task", options["task"], envs.TASKS)
+        path = Path(options["out"]) / "entropy.md"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torch.set_num_threads(1)
+        lines = ["| task | target | uniform | " + " | ".join(MAPS) + " |", "|---|" + "---:|" * (2 + len(MAPS))]
+        lines += ["| " + " | ".join(measure(task, states)) + " |" for task in tqdm(tasks, unit="task")]
+        print("\n".join(lines))
+        path.write_text("\n".join(lines) + "\n")
+    except (ConfigError, OSError) as error:
+        print(f"bench/entropy.py: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

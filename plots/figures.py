@@ -112,7 +112,8 @@ def _draw_training(
         _label_axes(axes, measure.capitalize())
         if measure in LOGARITHMIC:
             axes.set_yscale("log")
-            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            low, high = axes.get_ylim()
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
             axes.yaxis.set_minor_locator(NullLocator())
             axes.yaxis.set_major_formatter("{x:g}")
     figure.suptitle(fill(", ".join([f"{task} (mean ± standard error)", *common]), 110))

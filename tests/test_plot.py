@@ -569,6 +569,19 @@ def test_training_measures_side_by_side(tmp_path, monkeypatch):
     assert (tmp_path / "figures" / "R+L2-training.pdf").exists()
 
 
+@pytest.mark.parametrize("last", [0.2, 40.0, 1e17])
+def test_temperatures_have_ticks_over_any_range(tmp_path, monkeypatch, last):
+    writer = write_run(tmp_path, "R+T", "SRad", 0)
+    for step, temperature in ((10_000, 0.1), (15_000, last)):
+        writer.append_statistics(step, {"temperature": temperature, "entropy": -1.0})
+    drawn = {}
+    monkeypatch.setattr(figures, "save", lambda figure, folder, name, formats: drawn.setdefault(name, figure) and [])
+    assert plot.main([str(tmp_path)]) == 0
+    axes = drawn["R+T-training"].axes[1]
+    low, high = axes.get_ylim()
+    assert 2 <= sum(low <= tick <= high for tick in axes.get_yticks()) <= 12
+
+
 @pytest.mark.parametrize("content", ["what\n1\n", "step,temperature\n1\n", "step,temperature\nx,y\n"])
 def test_a_corrupt_training_file_is_named(tmp_path, content):
     path = write_run(tmp_path, "R+N", "SRad", 0).folder / "training.csv"

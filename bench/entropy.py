@@ -30,6 +30,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])
 import torch
 from scipy.stats import qmc
 from torch import Tensor
+from torch.distributions import Normal
 from tqdm import tqdm
 
 import envs
@@ -37,7 +38,7 @@ from bench.common import parse_options, positive
 from constraints import Constraint
 from core.config import ConfigError, split_names
 
-DIRECTIONS, SAMPLES, FRESH_SAMPLES, ASCENT_STEPS, RATE = 2**14, 256, 2**12, 300, 0.05
+DIRECTIONS, SAMPLES, FRESH_SAMPLES, ASCENT_STEPS, RATE = 2**14, 512, 2**12, 200, 0.05
 MAPS = {
     "SRad": ("radial", False),
     "SAlpha": ("alpha", False),
@@ -76,35 +77,41 @@ def uniform_entropy(constraint: Constraint, obs: Tensor) -> Tensor:
     return log_unit_ball + torch.logsumexp(dim * log_reach, -1) - math.log(DIRECTIONS)
 
 
-def policy_entropy(
-    constraint: Constraint, obs: Tensor, mean: Tensor, log_std: Tensor, noise: Tensor, mapping: str, unit_ball: bool
+@torch.no_grad()
+def log_density(
+    constraint: Constraint, obs: Tensor, action: Tensor, policy: Normal, mapping: str, unit_ball: bool
 ) -> Tensor:
-    """Entropy in every state of N(mean, diag std^2) (states, d) after the map."""
-    action = mean + log_std.exp() * noise.unsqueeze(1)
+    """Log-density (samples, states) of the mapped `action` (samples, states, d) drawn from `policy` (states, d)."""
     ray = constraint.ray(obs, action, constraint.center(obs))
     if mapping == "alpha":
-        return -ray.alpha_log_prob(mean, log_std.exp(), unit_ball).mean(0)
-    log_prob = torch.distributions.Normal(mean, log_std.exp()).log_prob(action).sum(-1)
-    return -ray.radial_log_prob(log_prob, unit_ball).mean(0)
+        return ray.alpha_log_prob(policy.mean, policy.stddev, unit_ball)
+    return ray.radial_log_prob(policy.log_prob(action).sum(-1), unit_ball)
 
 
 def largest_entropy(constraint: Constraint, obs: Tensor, mapping: str, unit_ball: bool) -> Tensor:
     """The most entropy in every state that a Gaussian with independent coordinates has after the map."""
     dim, center = constraint.dim, constraint.center(obs)
-    noise = normal_noise(SAMPLES, dim, seed=1)
+    noise = normal_noise(SAMPLES, dim, seed=1).unsqueeze(1)
     reach = torch.stack([1 / constraint.gauge(obs, axis, center) for axis in torch.eye(dim).double()], -1)
     mean = (center + 0.1 * reach).requires_grad_()  # not the centre itself, which may be a saddle point
     log_std = reach.log().requires_grad_()
     optimizer = torch.optim.Adam([mean, log_std], RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, ASCENT_STEPS)
     for _ in range(ASCENT_STEPS):
+        policy = Normal(mean, log_std.exp())
+        action = (mean + log_std.exp() * noise).detach()
+        # The gradient of an entropy is -E[log q grad log p]. SAC's own, through the action, would miss what passes from
+        # inside to the boundary under the alpha map, where log q jumps.
+        surprise = log_density(constraint, obs, action, policy, mapping, unit_ball)
+        loss = ((surprise - surprise.mean(0)) * policy.log_prob(action).sum(-1)).mean(0).sum()
         optimizer.zero_grad()
-        (-policy_entropy(constraint, obs, mean, log_std, noise, mapping, unit_ball).sum()).backward()
+        loss.backward()
         optimizer.step()
         schedule.step()
     with torch.no_grad():
-        fresh = normal_noise(FRESH_SAMPLES, dim, seed=2)
-        return policy_entropy(constraint, obs, mean, log_std, fresh, mapping, unit_ball)
+        policy = Normal(mean, log_std.exp())
+        action = mean + log_std.exp() * normal_noise(FRESH_SAMPLES, dim, seed=2).unsqueeze(1)
+        return -log_density(constraint, obs, action, policy, mapping, unit_ball).mean(0)
 
 
 def measure(task: str, states: int) -> list[str]:

@@ -3,13 +3,13 @@
     python bench/entropy.py                                # all tasks
     python bench/entropy.py task=R+L2,R+T states=256       # two of them, at more states
 
-Prints a table and saves it in `out` (default bench/results) as entropy.md. For each task, means over `states` that a
-run's warm-up visits:
+Prints a table and saves it in `out` (default bench/results) as entropy.md; all take some fifteen minutes. For each
+task, means over `states` that a run's warm-up visits:
 
 - target: SAC's, -d.
 - uniform: the entropy of the uniform distribution on the feasible set, the log of its volume. No policy has more.
 - SRad, SAlpha: the most that N(mean, diag std^2) has after the map, in the measure of `entropy=paper`; found by
-  gradient ascent on mean and std in each state, and measured with noise that the ascent has not seen.
+  gradient ascent on mean and std in each state, so at least, and measured with noise that the ascent has not seen.
 - SRad ball, SAlpha ball: the same in the measure of `entropy=ball`.
 
 A target above what the map can reach makes the temperature rise without end; one just below keeps the policy as random
@@ -124,7 +124,10 @@ def measure(task: str, states: int) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Exit code: 0 done, 2 bad input."""
+    """Exit code: 0 done, 2 bad input, 130 interrupted."""
+    if {"-h", "--help", "help"} & set(arguments):
+        print(__doc__.strip())
+        return 0
     try:
         options = parse_options(arguments, {"task": "all", "states": "64", "out": "bench/results"})
         states = positive("states", options["states"])
@@ -132,14 +135,19 @@ def main(arguments: list[str]) -> int:
         path = Path(options["out"]) / "entropy.md"
         path.parent.mkdir(parents=True, exist_ok=True)
         torch.set_num_threads(1)
-        lines = ["| task | target | uniform | " + " | ".join(MAPS) + " |", "|---|" + "---:|" * (2 + len(MAPS))]
-        lines += ["| " + " | ".join(measure(task, states)) + " |" for task in tqdm(tasks, unit="task")]
+        lines = [f"Means over {states} states.", "", f"| task | target | uniform | {' | '.join(MAPS)} |"]
+        lines.append("|---|" + "---:|" * (2 + len(MAPS)))
+        try:
+            for task in tqdm(tasks, unit="task"):
+                lines.append(f"| {' | '.join(measure(task, states))} |")
+                path.write_text("\n".join(lines) + "\n")
+        except KeyboardInterrupt:
+            print("\ninterrupted; what is measured stays", file=sys.stderr)
         print("\n".join(lines))
-        path.write_text("\n".join(lines) + "\n")
     except (ConfigError, OSError) as error:
         print(f"bench/entropy.py: {error}", file=sys.stderr)
         return 2
-    return 0
+    return 0 if len(lines) == 4 + len(tasks) else 130
 
 
 if __name__ == "__main__":

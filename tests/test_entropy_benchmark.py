@@ -103,9 +103,22 @@ def test_srad_cannot_reach_its_target_on_the_tip_task(bench):
 def test_from_the_command_line(bench, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(bench, "ASCENT_STEPS", 2)
     assert bench.main(["task=R+L2,H+M", "states=2", f"out={tmp_path}"]) == 0
-    rows = (tmp_path / "entropy.md").read_text().splitlines()[2:]
+    rows = (tmp_path / "entropy.md").read_text().splitlines()[4:]
     assert [row.split(" | ")[:2] for row in rows] == [["| R+L2", "-2"], ["| H+M", "-3"]]
     assert "| R+L2 |" in capsys.readouterr().out
     for words, bad in [(["task=R+X"], "R+X"), (["states=0"], "'0'"), (["seed=1"], "seed")]:
         assert bench.main(words) == 2
         assert bad in capsys.readouterr().err
+    assert bench.main(["--help"]) == 0 and "python bench/entropy.py" in capsys.readouterr().out
+
+
+def test_interrupted_it_keeps_what_it_has(bench, tmp_path, capsys, monkeypatch):
+    def measure(task, states):
+        if task == "R+T":
+            raise KeyboardInterrupt
+        return [task, "-2"]
+
+    monkeypatch.setattr(bench, "measure", measure)
+    assert bench.main(["task=R+L2,R+T,H+M", f"out={tmp_path}"]) == 130
+    assert (tmp_path / "entropy.md").read_text().splitlines()[4:] == ["| R+L2 | -2 |"]
+    assert "interrupted" in capsys.readouterr().err

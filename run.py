@@ -6,7 +6,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import torch
 import envs
 from algos import ALGORITHMS, NFWPO
 from constraints import ConstraintError
-from core.checkpoint import Checkpoint, CheckpointFolder, choose
+from core.checkpoint import Checkpoint, CheckpointFolder, FormatError, choose
 from core.config import (
     RUN_KEYS,
     Config,
@@ -47,6 +47,10 @@ from envs import TASKS, TOLERANCE
 from sweep.launch import launch
 from sweep.settings import SLURM_PREFIX, SlurmSettings, SweepSettings, parse_sweep
 from sweep.status import describe_status
+
+THREADS = min(torch.get_num_threads(), 4)
+"""The threads of a cell that is alone on the machine: all physical cores (or OMP_NUM_THREADS), but no more than 4, as
+the networks are small."""
 
 
 def usage() -> str:
@@ -125,6 +129,7 @@ def _paper_config(name: str, task: str) -> Config:
         frank_wolfe=issubclass(algorithm.agent, NFWPO),
         penalty=algorithm.penalty,
         steps=TASKS[task].steps,
+        simulator=next(iter(TASKS[task].robot.simulators), None),
     )
 
 
@@ -140,7 +145,11 @@ def make_trainer(
     ConfigError where networks and replay buffer do not fit into memory.
     """
     algorithm = ALGORITHMS[config.algo]
-    train_envs = [envs.make(config.env) for _ in seeds]
+
+    def make_env() -> envs.ActionConstrainedEnv:
+        return envs.make(config.env, simulator=config.simulator)
+
+    train_envs = [make_env() for _ in seeds]
     try:
         agent = algorithm.agent(
             config,
@@ -150,7 +159,7 @@ def make_trainer(
             mapping=algorithm.mapping,
             placement=algorithm.placement,
         )
-        return Trainer(config, agent, train_envs, lambda: envs.make(config.env), writers, progress, check)
+        return Trainer(config, agent, train_envs, make_env, writers, progress, check)
     except RuntimeError as error:
         if not any(words in str(error) for words in ("allocate memory", "out of memory")):
             raise
@@ -159,10 +168,14 @@ def make_trainer(
         ) from error
 
 
-def check_constraint(task: str) -> None:
-    """ConfigError, before anything is trained, where the constraint of `task` does not work on its robot."""
+def check_constraint(task: str, simulator: str | None) -> None:
+    """ConfigError, before anything is trained, where the constraint of `task` does not work on its robot, or where the
+    robot's simulator is not there."""
     constraint = TASKS[task].constraint
-    env = envs.make(task)
+    try:
+        env = envs.make(task, simulator=simulator)
+    except envs.UnavailableError as error:
+        raise ConfigError(str(error)) from error
     try:
         obs = torch.from_numpy(env.reset(seed=0)[0]).float().unsqueeze(0)
         if constraint.dim != env.robot.action_dim:
@@ -183,7 +196,7 @@ def train(config: Config, base: Config, check: Callable[[], None] = lambda: None
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
         torch.cuda.set_device(config.device)
-    check_constraint(config.env)
+    check_constraint(config.env, config.simulator)
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     if config.steps <= config.learning_starts:
         print(
@@ -316,13 +329,15 @@ def main(arguments: list[str]) -> int:
         with Interrupts() as interrupts:
             sweep, words = parse_sweep(arguments)
             cells = plan(words)
+            threads_given = any(word.startswith("threads=") for word in words)
             if sweep.wanted:
                 if sweep.settings.launcher == "local":
                     check_device(cells[0][0].device)
-                threads_given = any(word.startswith("threads=") for word in words)
                 return launch(sweep, cells, threads_given, interrupts.check)
+            if not threads_given:
+                cells = [(replace(config, threads=THREADS), base) for config, base in cells]
             done = [train(config, base, interrupts.check) for config, base in cells]
-    except (ConfigError, ConstraintError, LockedError) as error:
+    except (ConfigError, ConstraintError, FormatError, LockedError) as error:
         print(f"run.py: {one_line(error)}", file=sys.stderr)
         return 2
     except OSError as error:

@@ -61,15 +61,18 @@ class Config:
     # The run itself; none of these changes what is learned, beyond float rounding.
     results: str = field(default="results", metadata={"help": "folder that results go to"})
     overwrite: bool = field(default=False, metadata={"help": "start again in any case; the old run is kept"})
+    simulator: str | None = field(
+        default=None, metadata={"help": "Reacher: 'closed-form', or 'pybullet', its reference, where that is installed"}
+    )
     device: str = field(
         default="cpu",
         metadata={"help": "of networks and replay buffer: cpu, cuda or cuda:1"},
     )
-    threads: int = field(default=1, metadata={"help": "CPU threads of PyTorch"})
+    threads: int = field(default=1, metadata={"help": "CPU threads (default: a cell alone up to 4, in a sweep 1)"})
     checkpoint_every: int = field(default=10_000, metadata={"help": "environment steps of a seed between checkpoints"})
 
 
-RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "device", "threads", "checkpoint_every")
+RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "simulator", "device", "threads", "checkpoint_every")
 """Settings that do not make a run another experiment: they never show in a run's name."""
 
 TD3_CONSTANTS = {"policy_delay": 2, "target_noise": 0.2, "target_noise_clip": 0.5}
@@ -115,13 +118,21 @@ HYPERPARAMETERS: dict[tuple[str, str], dict] = {
 
 
 def defaults(
-    algo: str, env: str, robot: str, base: str, mapping: str, frank_wolfe: bool, penalty: bool, steps: int
+    algo: str,
+    env: str,
+    robot: str,
+    base: str,
+    mapping: str,
+    frank_wolfe: bool,
+    penalty: bool,
+    steps: int,
+    simulator: str | None = None,
 ) -> Config:
     """The paper's configuration of one cell.
 
     `robot` is the task's robot, `base` is "TD3" or "SAC", `mapping` the algorithm's map; `frank_wolfe` and `penalty`
     say whether the algorithm takes Frank-Wolfe steps and has the penalty term; `steps` is the task's length of
-    training.
+    training and `simulator` the one that it runs on, where there is a choice.
     """
     group = robot if robot in ("Reacher", "Hopper") else "Others"
     table = dict(HYPERPARAMETERS[group, base])
@@ -133,7 +144,7 @@ def defaults(
         table.pop("fw_learning_rate", None)
     if penalty:
         table["penalty"] = 1.0
-    return Config(algo=algo, env=env, steps=steps, **table)
+    return Config(algo=algo, env=env, steps=steps, simulator=simulator, **table)
 
 
 def choose(kind: str, value: str, choices: Iterable[str]) -> str:
@@ -227,7 +238,7 @@ def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
         if key in ("algo", "env"):
             continue
         if getattr(base, key) is None:
-            raise ConfigError(f"{key} does not apply to {base.algo}")
+            raise ConfigError(f"{key} does not apply to {base.env if key == 'simulator' else base.algo}")
         override(config, Config, key, text)
     resolved = typing.cast(Config, OmegaConf.to_object(config))
     _check_ranges(resolved)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from core.config import Config, ConfigError
 from sweep.cells import cell_of, job_states
 from sweep.cluster import submit
-from sweep.local import cores, run_queue
+from sweep.local import run_queue
 from sweep.plan import describe_plan, make_plan, memory_warning
 from sweep.settings import Sweep
 
@@ -22,7 +22,7 @@ def launch(sweep: Sweep, cells: Sequence[tuple[Config, Config]], threads_given: 
     on_slurm = sweep.settings.launcher == "slurm"
     jobs = sweep.slurm.parallel if on_slurm else sweep.settings.jobs or 1
     if not threads_given:
-        threads = sweep.slurm.cpus if on_slurm else max(1, cores() // jobs)
+        threads = sweep.slurm.cpus if on_slurm else 1
         cells = [(replace(config, threads=threads), base) for config, base in cells]
     if on_slurm and cells[0][0].overwrite:
         raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -125,10 +124,3 @@ def run_queue(entries: Sequence[Entry], jobs: int, check: Callable[[], None]) ->
         print("interrupted; the same command resumes (without overwrite=true)", file=sys.stderr)
         raise interrupted
     return 4 if display.failed else 2 if elsewhere else 3 if display.diverged else 0
-
-
-def cores() -> int:
-    """Those that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

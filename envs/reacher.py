@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -66,12 +66,15 @@ _DEEPEST_CORRECTED = -_single(0.04)  # past this, Bullet stops the joint and doe
 # ---------------------------------------------------------------- the dynamics
 
 
-def _root(x: float) -> float:
-    return math.sqrt(x) if x > _TINY else 0.0
+class Arithmetic(NamedTuple):
+    """The functions that differ between floats and arrays. They round alike, so one arm and many have the same bits."""
 
-
-def _roots(x: np.ndarray) -> np.ndarray:
-    return np.where(x > _TINY, np.sqrt(x), 0.0)
+    cos: Callable[[Any], Any]
+    sin: Callable[[Any], Any]
+    sqrt: Callable[[Any], Any]
+    root: Callable[[Any], Any]  # the square root as Bullet takes it of squared lengths
+    clip: Callable[[Any, float, float], Any]
+    stop: Callable[..., Any]  # `_stop` where joint 1 is at its limit
 
 
 def _accelerate(
@@ -135,10 +138,6 @@ def _accelerate(
     return -a1, -a2, inverse, rx, c
 
 
-def _bounded(speed: float) -> float:
-    return min(max(speed, -LARGEST_SPEED), LARGEST_SPEED)
-
-
 def _stop(q2: float, w1: float, w2: float, inverse: float, rx: float, c: float) -> tuple[float, float]:
     """The joint speeds after the impulse of the limit on joint 1, for |q2| >= 3.
 
@@ -155,43 +154,100 @@ def _stop(q2: float, w1: float, w2: float, inverse: float, rx: float, c: float) 
     impulse = max(wanted * mass + side * w2 * mass, 0.0)
     # The solver's second iteration corrects no more than rounding.
     rest = impulse - r2 * impulse * mass if (impulse / mass) ** 2 > 1e-7 else 0.0
-    w1 = _bounded(w1 - side * (r1 * impulse + r1 * rest))
-    w2 = _bounded(w2 - side * (r2 * impulse + r2 * rest))
+    w1 = _clip(w1 - side * (r1 * impulse + r1 * rest), -LARGEST_SPEED, LARGEST_SPEED)
+    w2 = _clip(w2 - side * (r2 * impulse + r2 * rest), -LARGEST_SPEED, LARGEST_SPEED)
     return w1, w2
 
 
-def step_one(q1: float, q2: float, w1: float, w2: float, t1: float, t2: float) -> tuple[float, float, float, float]:
-    """Angles and speeds (q1, q2, w1, w2) of one arm a time step later, under the torques `t1`, `t2`."""
-    a1, a2, inverse, rx, c = _accelerate(math.cos(0.5 * q2), math.sin(0.5 * q2), w1, w2, t1, t2, _root)
-    w1, w2 = _bounded(w1 + a1 * TIME_STEP), _bounded(w2 + a2 * TIME_STEP)
-    if abs(q2) >= LIMIT:
-        w1, w2 = _stop(q2, w1, w2, inverse, rx, c)
+def advance(
+    q1: Value, q2: Value, w1: Value, w2: Value, t1: Value, t2: Value, arithmetic: Arithmetic
+) -> tuple[Value, Value, Value, Value]:
+    """Angles and speeds (q1, q2, w1, w2) a time step later, under the torques `t1`, `t2`."""
+    half = 0.5 * q2
+    a1, a2, *rest = _accelerate(arithmetic.cos(half), arithmetic.sin(half), w1, w2, t1, t2, arithmetic.root)
+    w1 = arithmetic.clip(w1 + a1 * TIME_STEP, -LARGEST_SPEED, LARGEST_SPEED)
+    w2 = arithmetic.clip(w2 + a2 * TIME_STEP, -LARGEST_SPEED, LARGEST_SPEED)
+    w1, w2 = arithmetic.stop(q2, w1, w2, *rest)
     return q1 + TIME_STEP * w1, q2 + TIME_STEP * w2, w1, w2
 
 
-def step_many(state: np.ndarray, torques: np.ndarray) -> np.ndarray:
-    """`step_one` for many arms: `state` (4, n) of rows q1, q2, w1, w2 and `torques` (2, n) -> (4, n), the same bits."""
-    q2 = state[1]
+def _root(x: float) -> float:
+    return math.sqrt(x) if x > _TINY else 0.0
+
+
+def _clip(x: float, low: float, high: float) -> float:
+    return min(max(x, low), high)
+
+
+def _stop_one(q2: float, w1: float, w2: float, *rest: float) -> tuple[float, float]:
+    return _stop(q2, w1, w2, *rest) if abs(q2) >= LIMIT else (w1, w2)
+
+
+def _stop_many(q2: np.ndarray, w1: np.ndarray, w2: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    for k in np.flatnonzero(np.abs(q2) >= LIMIT).tolist():
+        w1[k], w2[k] = _stop(*(float(x[k]) for x in (q2, w1, w2, *rest)))
+    return w1, w2
+
+
+FLOATS = Arithmetic(math.cos, math.sin, math.sqrt, _root, _clip, _stop_one)
+ARRAYS = Arithmetic(
     # The C library's functions, as in Bullet: NumPy's may differ in the last bit.
-    halves = (0.5 * q2).tolist()
-    half_cos, half_sin = np.array([*map(math.cos, halves)]), np.array([*map(math.sin, halves)])
-    accelerations = _accelerate(half_cos, half_sin, state[2], state[3], torques[0], torques[1], _roots)
-    speeds = np.clip(state[2:] + np.stack(accelerations[:2]) * TIME_STEP, -LARGEST_SPEED, LARGEST_SPEED)
-    for k in np.flatnonzero(np.abs(q2) >= LIMIT):
-        speeds[:, k] = _stop(float(q2[k]), *speeds[:, k].tolist(), *(float(x[k]) for x in accelerations[2:]))
-    return np.concatenate((state[:2] + TIME_STEP * speeds, speeds))
+    cos=lambda x: np.array([*map(math.cos, x.tolist())]),
+    sin=lambda x: np.array([*map(math.sin, x.tolist())]),
+    sqrt=np.sqrt,
+    root=lambda x: np.where(x > _TINY, np.sqrt(x), 0.0),
+    clip=np.clip,
+    stop=_stop_many,
+)
 
 
 # ---------------------------------------------------------------- the robot
 
-MANY = 48
+MANY = 40
 """From so many arms on, arrays are faster than a loop over floats."""
 
 
-def _fingertip(q1: float, q2: float) -> tuple[float, float, float, float]:
-    """Position x, y of the fingertip, and cosine and sine of `q1`."""
-    cos, sin, total = math.cos(q1), math.sin(q1), q1 + q2
-    return _UPPER * cos + _FORE * math.cos(total), _UPPER * sin + _FORE * math.sin(total), cos, sin
+class State(NamedTuple):
+    """An arm's state: angles and speeds of the joints, target, and the fingertip that the observation reports.
+
+    That fingertip is one step late: Bullet reports its position at the start of a step, beside the angles at the end.
+    The reward uses the same late position.
+    """
+
+    q1: Any
+    q2: Any
+    w1: Any
+    w2: Any
+    target_x: Any
+    target_y: Any
+    seen_x: Any
+    seen_y: Any
+
+    def fingertip(self, arithmetic: Arithmetic) -> tuple[Any, Any]:
+        """Where the fingertip is."""
+        cos, sin, total = arithmetic.cos, arithmetic.sin, self.q1 + self.q2
+        return _UPPER * cos(self.q1) + _FORE * cos(total), _UPPER * sin(self.q1) + _FORE * sin(total)
+
+    def observation(self, arithmetic: Arithmetic) -> tuple[Any, ...]:
+        """The nine numbers of `Reacher`'s observation."""
+        to_target = self.seen_x - self.target_x, self.seen_y - self.target_y
+        angle = arithmetic.cos(self.q1), arithmetic.sin(self.q1), 0.1 * self.w1
+        return (self.target_x, self.target_y, *to_target, *angle, self.q2 / LIMIT, 0.1 * self.w2)
+
+    def potential(self, arithmetic: Arithmetic) -> Any:
+        """-100 times the distance of the reported fingertip from the target."""
+        x, y = self.seen_x - self.target_x, self.seen_y - self.target_y
+        return -100.0 * arithmetic.sqrt(x * x + y * y)
+
+    def after(self, a1: Any, a2: Any, arithmetic: Arithmetic) -> tuple[State, Any]:
+        """The state after a step under the action (a1, a2), and the reward."""
+        t1, t2 = TORQUE * arithmetic.clip(a1, -1.0, 1.0), TORQUE * arithmetic.clip(a2, -1.0, 1.0)
+        q1, q2, w1, w2 = advance(self.q1, self.q2, self.w1, self.w2, t1, t2, arithmetic)
+        state = State(q1, q2, w1, w2, self.target_x, self.target_y, *self.fingertip(arithmetic))
+        progress = state.potential(arithmetic) - self.potential(arithmetic)
+        electricity = -0.10 * (abs(a1 * (0.1 * w1)) + abs(a2 * (0.1 * w2))) - 0.01 * (abs(a1) + abs(a2))
+        stuck = -0.1 * (abs(abs(q2 / LIMIT) - 1.0) < 0.01)
+        return state, progress + electricity + stuck
 
 
 class Reacher(Robot):
@@ -200,9 +256,6 @@ class Reacher(Robot):
     Observation (9,): target x, y; fingertip minus target x, y; cos and sin of joint 0; its velocity
     (x 0.1); joint 1's position (mapped to +-1 over its limits of +-3 rad) and velocity (x 0.1).
     Action (2,): torques of the two joints in units of 0.05.
-
-    The observed fingertip is one step late: Bullet reports the position at the start of the step, beside the angles at
-    its end. The reward uses the same late position.
     """
 
     obs_dim, action_dim = 9, 2
@@ -214,83 +267,50 @@ class Reacher(Robot):
     }
 
     def __init__(self) -> None:
-        self.angles = self.speeds = self.target = (0.0, 0.0)
-        self._seen = (0.0, 0.0)  # the fingertip as the observation reports it
-        self._place()
+        self.state = State(*[0.0] * 8)
 
     def reset(self, rng: np.random.Generator) -> np.ndarray:
         """Draw target and joint positions from `rng`; return the observation (9,)."""
-        self.target = rng.uniform(-0.27, 0.27), rng.uniform(-0.27, 0.27)
-        self.angles = rng.uniform(-3.14, 3.14), rng.uniform(-3.14, 3.14)
-        self.speeds = 0.0, 0.0
-        self._place()
-        self._seen = self._tip
-        return self._observe()
+        target = rng.uniform(-0.27, 0.27), rng.uniform(-0.27, 0.27)
+        angles = rng.uniform(-3.14, 3.14), rng.uniform(-3.14, 3.14)
+        start = State(*angles, 0.0, 0.0, *target, 0.0, 0.0)
+        self.state = State(*start[:6], *start.fingertip(FLOATS))
+        return np.array(self.state.observation(FLOATS))
 
     def step(self, action: np.ndarray) -> Step:
         """Apply `action` (2,) for 0.0165 s; return obs (9,), reward, False (never ends), info."""
         a1, a2 = map(float, action)
-        return self._arrive(a1, a2, *step_one(*self.angles, *self.speeds, _torque(a1), _torque(a2)))
+        self.state, reward = self.state.after(a1, a2, FLOATS)
+        return np.array(self.state.observation(FLOATS)), reward, False, {}
 
     @classmethod
     def step_together(cls, robots: Sequence[Robot], actions: Sequence[np.ndarray]) -> list[Step]:
         """`step` of many arms in one call, with the same bits."""
         if len(robots) < MANY:
             return super().step_together(robots, actions)
-        arms = [robot for robot in robots if isinstance(robot, Reacher)]
-        pairs = [tuple(map(float, action)) for action in actions]
-        state = np.array([(*arm.angles, *arm.speeds) for arm in arms]).T
-        torques = TORQUE * np.clip(np.array(pairs).T, -1.0, 1.0)
-        arrived = step_many(state, torques).T.tolist()
-        return [arm._arrive(*pair, *row) for arm, pair, row in zip(arms, pairs, arrived, strict=True)]
+        arms = cast("Sequence[Reacher]", robots)
+        state = State(*np.array([arm.state for arm in arms]).T)
+        a1, a2 = np.array(actions, np.float64).T
+        state, reward = state.after(a1, a2, ARRAYS)
+        for arm, numbers in zip(arms, np.stack(state, -1).tolist(), strict=True):
+            arm.state = State(*numbers)
+        obs = np.stack(state.observation(ARRAYS), -1)
+        return [(row, value, False, {}) for row, value in zip(obs, reward.tolist(), strict=True)]
 
     def get_state(self) -> np.ndarray:
-        """Angles, speeds, target and observed fingertip (8,)."""
-        return np.array((*self.angles, *self.speeds, *self.target, *self._seen))
+        """The numbers of `State` (8,)."""
+        return np.array(self.state)
 
     def set_state(self, state: np.ndarray) -> np.ndarray:
         """Take up `state` (8,) from `get_state`; return the observation (9,)."""
-        q1, q2, w1, w2, x, y, seen_x, seen_y = state.tolist()
-        self.angles, self.speeds, self.target = (q1, q2), (w1, w2), (x, y)
-        self._place()
-        self._seen = seen_x, seen_y
-        return self._observe()
+        self.state = State(*state.tolist())
+        return np.array(self.state.observation(FLOATS))
 
     def render(self) -> np.ndarray:
         """Picture of the arena from above (480, 480, 3), uint8."""
-        elbow = _UPPER * self._cos, _UPPER * self._sin
-        return draw_arm(elbow, self._tip, self.target, LIMIT)
+        state = self.state
+        elbow = _UPPER * math.cos(state.q1), _UPPER * math.sin(state.q1)
+        return draw_arm(elbow, state.fingertip(FLOATS), (state.target_x, state.target_y), LIMIT)
 
     def close(self) -> None:
         """There is nothing to free."""
-
-    def _place(self) -> None:
-        x, y, self._cos, self._sin = _fingertip(*self.angles)
-        self._tip = x, y
-
-    def _arrive(self, a1: float, a2: float, q1: float, q2: float, w1: float, w2: float) -> Step:
-        """Take up the state after a step under the action (a1, a2); return what `step` does."""
-        before = self._potential()
-        self._seen = self._tip
-        self.angles, self.speeds = (q1, q2), (w1, w2)
-        self._place()
-        obs = self._observe()
-        progress = self._potential() - before
-        electricity = -0.10 * (abs(a1 * (0.1 * w1)) + abs(a2 * (0.1 * w2))) - 0.01 * (abs(a1) + abs(a2))
-        stuck = -0.1 if abs(abs(q2 / LIMIT) - 1.0) < 0.01 else 0.0
-        return obs, progress + electricity + stuck, False, {}
-
-    def _observe(self) -> np.ndarray:
-        x, y = self.target
-        to_target = self._seen[0] - x, self._seen[1] - y
-        w1, w2 = self.speeds
-        return np.array((x, y, *to_target, self._cos, self._sin, 0.1 * w1, self.angles[1] / LIMIT, 0.1 * w2))
-
-    def _potential(self) -> float:
-        """-100 times the distance of the observed fingertip from the target."""
-        x, y = self._seen[0] - self.target[0], self._seen[1] - self.target[1]
-        return -100.0 * math.sqrt(x * x + y * y)
-
-
-def _torque(action: float) -> float:
-    return TORQUE * min(max(action, -1.0), 1.0)

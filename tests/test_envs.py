@@ -127,7 +127,7 @@ def joint_angles_and_velocities(env):
     """theta and w (d,) of the driven joints, looked up by joint in the simulator rather than by index in obs."""
     robot = env.robot
     if isinstance(robot, Reacher):
-        return np.array(robot.angles) * (1, 1 / 3), 0.1 * np.array(robot.speeds)
+        return np.array(robot.state[:2]) * (1, 1 / 3), 0.1 * np.array(robot.state[2:4])
     joints = robot.model.actuator_trnid[:, 0]
     angles = robot.data.qpos[robot.model.jnt_qposadr[joints]]
     velocities = robot.data.qvel[robot.model.jnt_dofadr[joints]]

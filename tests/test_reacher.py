@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs import reacher
 from envs.pybullet_reacher import PyBulletReacher
-from envs.reacher import MANY, Reacher, step_many, step_one
+from envs.reacher import ARRAYS, FLOATS, MANY, Reacher, State, advance
 
 DATA = Path(__file__).parent / "data"
 SAME_BITS = platform.machine() == "x86_64" and platform.libc_ver()[0] == "glibc"
@@ -71,7 +70,7 @@ def test_single_steps_equal_recorded_ones_of_pybullet():
     state = np.concatenate((recorded["q"].T, recorded["qd"].T))
     wanted = np.concatenate((recorded["next_q"].T, recorded["next_qd"].T))
     assert (np.abs(state[1]) >= 3).mean() > 0.2 and np.abs(state[2:]).max() > 50  # the limit and spinning arms
-    np.testing.assert_allclose(step_many(state, recorded["torque"].T), wanted, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(np.stack(advance(*state, *recorded["torque"].T, ARRAYS)), wanted, rtol=1e-12, atol=1e-12)
 
 
 def test_episodes_that_spin_and_hit_the_limit_equal_recorded_ones_of_pybullet():
@@ -82,7 +81,7 @@ def test_episodes_that_spin_and_hit_the_limit_equal_recorded_ones_of_pybullet():
         state = (*q[0].tolist(), *w[0].tolist())
         for action, before, *after in zip(actions[:steps], q, q[1:], w[1:], strict=False):
             limited += abs(before[1]) >= 3
-            state = step_one(*state, *(0.05 * np.clip(action, -1, 1)).tolist())
+            state = advance(*state, *(0.05 * np.clip(action, -1, 1)).tolist(), FLOATS)
             if SAME_BITS:
                 np.testing.assert_array_equal(state, np.concatenate(after))
             else:
@@ -92,7 +91,7 @@ def test_episodes_that_spin_and_hit_the_limit_equal_recorded_ones_of_pybullet():
 
 def test_single_steps_equal_pybullets_in_every_bit(bullet):
     state, torques = states(np.random.default_rng(1), 3000)
-    got = step_many(state, torques)
+    got = np.stack(advance(*state, *torques, ARRAYS))
     for k in range(state.shape[1]):
         bullet.place(*state[:, k])
         np.testing.assert_array_equal(got[:, k], bullet.advance(*torques[:, k]))
@@ -115,7 +114,7 @@ def test_whole_episodes_equal_pybullets_in_every_bit(bullet, kind):
         state = (rng.uniform(-3, 3), rng.uniform(-3.14, 3.14), *rng.uniform(-speed, speed, 2))
         bullet.place(*state)
         for t1, t2 in (0.05 * actions).tolist():
-            state = step_one(*state, t1, t2)
+            state = advance(*state, t1, t2, FLOATS)
             assert state == bullet.advance(t1, t2)
 
 
@@ -137,15 +136,16 @@ def test_observations_and_rewards_are_those_of_pybullet(bullet):
 
 def test_floats_and_arrays_give_the_same_bits():
     state, torques = states(np.random.default_rng(5), 5000)
-    many = step_many(state, torques)
+    many = np.stack(advance(*state, *torques, ARRAYS))
     for k in range(state.shape[1]):
-        np.testing.assert_array_equal(step_one(*state[:, k].tolist(), *torques[:, k].tolist()), many[:, k])
+        one = advance(*state[:, k].tolist(), *torques[:, k].tolist(), FLOATS)
+        np.testing.assert_array_equal(one, many[:, k])
 
 
 def test_speeds_stay_below_the_largest():
     state = np.array([[0.0], [3.5], [100.0], [-100.0]])
     for _ in range(50):
-        state = step_many(state, np.array([[1.0], [-1.0]]))
+        state = np.stack(advance(*state, np.array([1.0]), np.array([-1.0]), ARRAYS))
         assert np.abs(state[2:]).max() <= 100
 
 
@@ -169,7 +169,8 @@ def test_many_arms_step_together_as_each_does_alone(count):
 def test_a_stuck_joint_is_penalised(robot):
     for gamma, penalty in ((2.985, -0.1), (-2.985, -0.1), (2.9, 0.0)):
         if isinstance(robot, Reacher):
-            robot.set_state(np.array([0.0, gamma, 0.0, 0.0, 0.0, 0.0, *reacher._fingertip(0.0, gamma)[:2]]))
+            state = State(0.0, gamma, *[0.0] * 6)
+            robot.set_state(np.array([*state[:6], *state.fingertip(FLOATS)]))
         else:
             robot.place(0.0, gamma, 0.0, 0.0)
         obs, reward, _, _ = robot.step(np.zeros(2))  # nothing moves: no progress, no cost of torques
@@ -186,7 +187,7 @@ def test_the_fingertip_is_where_the_angles_put_it_one_step_late():
     arm = Reacher()
     obs = arm.reset(np.random.default_rng(0))
     for _ in range(20):
-        before = arm.angles
+        before = arm.state[:2]
         np.testing.assert_array_equal(obs[4:6], (np.cos(before[0]), np.sin(before[0])))
         obs = arm.step(np.array([1.0, -1.0]))[0]
         np.testing.assert_allclose(obs[:2] + obs[2:4], tip(*before), atol=1e-7)

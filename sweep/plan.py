@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 from core.config import Config
-from core.results import Run, read_results
 from plots.tables import Table, text_cells, to_terminal
+from store.folder import Run, read_results
 from sweep import estimates
 from sweep.cells import Cell, State, cell_of, format_seeds, reached, shorten, state_of
 

@@ -13,8 +13,8 @@ import numpy as np
 from tqdm import tqdm
 
 from core.config import defaults, saved_settings
-from core.results import RunWriter, run_folder, variant_name
 from plots.paper import COLORS, DEFAULT_BATCH, FAMILIES, read_paper
+from store.folder import RunWriter, run_folder, variant_name
 
 CONDITIONS = list(dict.fromkeys((task, batch) for task, batch, _ in read_paper()))
 MAPPINGS = {"Alpha": "alpha", "Rad": "radial"}

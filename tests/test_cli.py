@@ -13,8 +13,8 @@ import yaml
 import run
 from algos import ALGORITHMS
 from core.config import HYPERPARAMETERS, Config, ConfigError, parse_seeds
-from core.results import read_run
 from envs import TASKS
+from store.folder import read_run
 
 ROOT = Path(__file__).parents[1]
 SHORT = ["steps=40", "learning_starts=20", "batch_size=8", "hidden=[16,16]", "eval_episodes=1", "final_episodes=2"]

@@ -16,9 +16,9 @@ import run
 from algos import ALGORITHMS
 from constraints import LinearConstraint
 from core.graph import EAGER_STEPS, GradientSteps, Tape
-from core.interrupt import Interrupted
 from core.replay import Replay
-from core.results import read_run
+from store.folder import read_run
+from store.interrupt import Interrupted
 
 SEEDS = [3, 8]
 BATCH = 16

@@ -48,3 +48,6 @@ ALGORITHMS: dict[str, Algorithm] = {
     "SRad": Algorithm(SAC, "radial", "layer"),
 }
 """The paper's 13 names, in the order of its table."""
+
+PAPER = tuple(ALGORITHMS)
+"""The names of the paper's own algorithms, which `algo=paper` stands for."""

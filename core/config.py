@@ -1,20 +1,22 @@
-"""The configuration: one typed dataclass, the paper's hyperparameter table, and the parsing of `key=value`."""
+"""The configuration: one typed dataclass, the paper's hyperparameter table, and the parsing of values."""
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from core.words import ConfigError
 
-class ConfigError(ValueError):
-    """A setting that the user can put right; its message is one line that names the value and the choices."""
+THREADS = min(torch.get_num_threads(), 4)
+"""The threads of a cell that is alone on the machine: all physical cores (or OMP_NUM_THREADS), but no more than 4, as
+the networks are small."""
 
 
 @dataclass
@@ -68,9 +70,14 @@ class Config:
         default="cpu",
         metadata={"help": "of networks and replay buffer: cpu, cuda or cuda:1"},
     )
-    threads: int = field(default=1, metadata={"help": "CPU threads (default: a cell alone up to 4, in a sweep 1)"})
+    threads: int = field(
+        default=THREADS, metadata={"help": "CPU threads (default: a cell alone up to 4, in a sweep 1)"}
+    )
     checkpoint_every: int = field(default=10_000, metadata={"help": "environment steps of a seed between checkpoints"})
 
+
+KEYS = tuple(f.name for f in fields(Config))
+"""The keys of a command line that trains."""
 
 RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "simulator", "device", "threads", "checkpoint_every")
 """Settings that do not make a run another experiment: they never show in a run's name."""
@@ -145,41 +152,6 @@ def defaults(
     if penalty:
         table["penalty"] = 1.0
     return Config(algo=algo, env=env, steps=steps, simulator=simulator, **table)
-
-
-def choose(kind: str, value: str, choices: Iterable[str]) -> str:
-    """`value` if it is one of `choices`, else a ConfigError that names them and the closest one."""
-    choices = list(choices)
-    if value in choices:
-        return value
-    by_folded = {choice.casefold(): choice for choice in choices}
-    close = difflib.get_close_matches(value.casefold(), by_folded, n=1, cutoff=0.6)
-    hint = f"; did you mean {by_folded[close[0]]}?" if close else ""
-    raise ConfigError(f"unknown {kind} {value!r}{hint} (choices: {', '.join(choices)})")
-
-
-def parse_arguments(arguments: Iterable[str]) -> dict[str, str]:
-    """`key=value` words as a dict. Raises ConfigError for a word of another form, an unknown key or one given twice."""
-    overrides: dict[str, str] = {}
-    names = [f.name for f in fields(Config)]
-    for word in arguments:
-        key, equals, value = word.partition("=")
-        if not equals or not value:
-            raise ConfigError(f"expected key=value, got {word!r}")
-        choose("key", key, names)
-        if key in overrides:
-            raise ConfigError(f"key {key!r} given twice: {overrides[key]!r} and {value!r}")
-        overrides[key] = value
-    return overrides
-
-
-def split_names(kind: str, value: str, choices: Iterable[str]) -> list[str]:
-    """A comma list of names in its order, or `all` in that of `choices`; ConfigError names a wrong one."""
-    choices = list(choices)
-    if value == "all":
-        return choices
-    wanted = [choose(kind, name, [*choices, "all"]) for name in value.split(",")]
-    return choices if "all" in wanted else list(dict.fromkeys(wanted))
 
 
 def parse_seeds(text: str) -> list[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import json
 import math
@@ -13,6 +12,7 @@ import gymnasium
 import numpy as np
 import torch
 
+from core.words import known_name
 from envs.drawing import draw_set
 from envs.robot import Robot, Step, UnavailableError
 from envs.tasks import TASKS, Task
@@ -29,11 +29,7 @@ class InfeasibleActionError(ValueError):
 
 def find_task(name: str) -> Task:
     """The `Task` called `name`; ValueError with the choices and the closest name where there is none."""
-    if name in TASKS:
-        return TASKS[name]
-    close = difflib.get_close_matches(str(name).upper(), TASKS, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    raise ValueError(f"unknown task {name!r}{hint} (choices: {' '.join(TASKS)})")
+    return TASKS[known_name("task", name, TASKS)]
 
 
 def make_robot(task: str, simulator: str | None = None) -> Robot:

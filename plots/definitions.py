@@ -10,14 +10,14 @@ from typing import Any, get_args
 from core.agent import MapName
 from core.config import HYPERPARAMETERS, RUN_KEYS, Config, defaults
 from envs.tasks import TASKS, Task
-from plots.tables import MISSING, Cell, Table, text_cells
+from tables import MISSING, Table, TableCell, text_cells
 
 
 def task_table(tasks: Mapping[str, Task] = TASKS) -> Table:
     """The paper's Table "Experiment environments and constraints", with the steps of training."""
     sections, records = [], []
     for robot, names in groupby(tasks, lambda name: tasks[name].robot.__name__):
-        rows: list[list[Cell]] = []
+        rows: list[list[TableCell]] = []
         for name in names:
             task = tasks[name]
             dim = task.constraint.dim
@@ -35,8 +35,8 @@ def hyperparameter_table() -> Table:
     """The paper's Table "Hyperparameters used in the experiments", then the constants that it leaves to its sources."""
     columns = {group: _configuration(*group) for group in HYPERPARAMETERS}
     in_paper = {key for settings in HYPERPARAMETERS.values() for key in settings}
-    published: list[list[Cell]] = []
-    further: list[list[Cell]] = []
+    published: list[list[TableCell]] = []
+    further: list[list[TableCell]] = []
     records = []
     for setting in fields(Config):
         key = setting.name

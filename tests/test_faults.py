@@ -11,18 +11,19 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from test_resume import Breaks, assert_identical, outcome, train, train_through
+from helpers import Breaks, assert_identical, outcome, run_command, train, train_through
 
-import run
-from core import config, results
-from core.checkpoint import Checkpoint, CheckpointFolder, choose
-from core.interrupt import Interrupted
-from core.lock import LockedError, run_lock
+from core import config
 from core.replay import Replay
+from store import folder as results
+from store.checkpoint import Checkpoint, CheckpointFolder, group_checkpoints
+from store.interrupt import Interrupted, Interrupts
+from store.lock import LockedError, run_lock
 
 ROOT = Path(__file__).parents[1]
 WORDS = (
@@ -156,7 +157,7 @@ A, B = (1, 2, 3), (4, 5)
 )
 def test_seeds_are_taken_up_at_a_moment_that_they_share(intact, moments, fresh):
     started = {seed: A if seed in A else B if seed in B else () for seed in intact}
-    groups, chosen_fresh = choose(intact, started)
+    groups, chosen_fresh = group_checkpoints(intact, started)
     assert [{seed: c.moment for seed, c in group.items()} for group in groups] == moments and chosen_fresh == fresh
 
 
@@ -166,7 +167,8 @@ def test_replay_files_hold_each_transition_once_and_go_when_it_is_overwritten(tm
     for number in range(130):
         replay.add([1], *(torch.full((2, width), float(number)) for width in replay.widths))
         if number % 20 == 19:
-            folder.write("moment", (2,), number, {}, {"number": number}, replay, 1)
+            stored = partial(replay.stretch, 1), max(0, replay.added[1] - 50), replay.added[1]
+            folder.write("moment", (2,), number, {}, {"number": number}, *stored)
             folder.keep()
             kept_files.append(sorted(path.name for path in (tmp_path / "checkpoint").glob("*.f32")))
     assert kept_files[:3] == [["replay-0-20.f32"]] * 1 + [
@@ -179,7 +181,7 @@ def test_replay_files_hold_each_transition_once_and_go_when_it_is_overwritten(tm
     for checkpoint, stop in ((newest_one, 120), (before, 100)):
         again = Replay([1, 2], 50, obs_dim=2, action_dim=1, centers=False)
         again.added[1] = stop
-        checkpoint.fill(again, 1)
+        checkpoint.fill(partial(again.stretch, 1), max(0, again.added[1] - 50))
         assert checkpoint.state() == {"number": stop - 1}
         assert sorted(again.rows[50:, 0].tolist()) == list(range(stop - 50, stop))
         assert again.rows[50 + (stop - 1) % 50].eq(stop - 1).all()
@@ -201,10 +203,10 @@ def test_settings_that_changed_are_not_mixed(tmp_path, capsys, monkeypatch):
     folder, _ = break_off(tmp_path)
     monkeypatch.setitem(config.HYPERPARAMETERS["Reacher", "TD3"], "tau", 0.5)
     capsys.readouterr()
-    assert run.main([*WORDS.split(), f"results={tmp_path}"]) == 2
+    assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 2
     err = capsys.readouterr().err
     assert f"{folder} was started with tau=0.005, which is 0.5 now; overwrite=true" in err and err.count("\n") == 1
-    assert run.main([*WORDS.split(), f"results={tmp_path}", "overwrite=true"]) == 0
+    assert run_command([*WORDS.split(), f"results={tmp_path}", "overwrite=true"]) == 0
     assert (folder.parent / "seed=3.old-1" / "checkpoint").is_dir() and (folder / "result.json").is_file()
 
 
@@ -318,7 +320,7 @@ def test_a_result_that_cannot_be_written_ends_the_run_with_one_line_and_it_can_b
     append = results.RunWriter._append
     with monkeypatch.context() as patch:
         patch.setattr(results.RunWriter, "_append", fill_disk)
-        assert run.main([*WORDS.split(), f"results={tmp_path}"]) == 2
+        assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 2
     err = capsys.readouterr().err
     (table,) = [path for path in tmp_path.glob("*/*/seed=?/evaluations.csv") if path.is_symlink()]
     assert err.splitlines()[-1] == f"run.py: {table}: no space left on device" and "Traceback" not in err
@@ -335,14 +337,14 @@ def test_a_run_in_progress_is_left_to_its_process(tmp_path, capsys):
     capsys.readouterr()
     with run_lock(folder):
         before = outcome_files(tmp_path)
-        assert run.main([*WORDS.split(), f"results={tmp_path}"]) == 2
-        assert run.main([*WORDS.split(), f"results={tmp_path}", "overwrite=true"]) == 2
+        assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 2
+        assert run_command([*WORDS.split(), f"results={tmp_path}", "overwrite=true"]) == 2
         err = capsys.readouterr().err
         said = f"run.py: {folder} is being trained by process {os.getpid()} on {socket.gethostname()}\n"
         assert err == 2 * said
         assert outcome_files(tmp_path) == before
     assert not list(tmp_path.rglob("*.lock"))  # the other seed's too
-    assert run.main([*WORDS.split(), f"results={tmp_path}"]) == 0
+    assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 0
 
 
 def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
@@ -406,12 +408,12 @@ def script(code):
 def test_a_second_signal_ends_the_process_at_once():
     done = script(
         "import os, signal\n"
-        "from core.interrupt import Interrupted, Interrupts\n"
+        "from store.interrupt import Interrupted, Interrupts\n"
         "with Interrupts() as interrupts:\n"
-        "    interrupts.check()\n"
+        "    interrupts.stop_if_asked()\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
         "    try:\n"
-        "        interrupts.check()\n"
+        "        interrupts.stop_if_asked()\n"
         "    except Interrupted as interrupted:\n"
         "        print('noted', interrupted.signum, flush=True)\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
@@ -423,11 +425,11 @@ def test_a_second_signal_ends_the_process_at_once():
 def test_handlers_are_put_back_and_an_ignored_signal_stays_ignored():
     done = script(
         "import os, signal\n"
-        "from core.interrupt import Interrupts\n"
+        "from store.interrupt import Interrupts\n"
         "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
         "with Interrupts() as interrupts:\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
-        "    interrupts.check()\n"
+        "    interrupts.stop_if_asked()\n"
         "print(signal.getsignal(signal.SIGTERM) == signal.SIG_DFL, signal.getsignal(signal.SIGINT) == signal.SIG_IGN)\n"
     )
     assert done.returncode == 0 and done.stdout.split() == ["True", "True"], done.stderr
@@ -436,12 +438,12 @@ def test_handlers_are_put_back_and_an_ignored_signal_stays_ignored():
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_the_exit_code_says_which_signal(tmp_path, capsys, monkeypatch, signum, unbroken):
     check = Breaks(77, error=Interrupted(signum))
-    monkeypatch.setattr(run.Interrupts, "check", lambda self: check())
+    monkeypatch.setattr(Interrupts, "stop_if_asked", lambda self: check())
     words = [*WORDS.split(), f"results={tmp_path}"]
-    assert run.main(words) == 128 + signum
+    assert run_command(words) == 128 + signum
     captured = capsys.readouterr()
     assert "interrupted at step" in captured.err and "the same command resumes" in captured.err
-    assert run.main(words) == 0
+    assert run_command(words) == 0
     assert capsys.readouterr().out.count("resuming from step") == 2
     assert_identical(outcome(tmp_path), unbroken)
 

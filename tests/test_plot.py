@@ -1,4 +1,4 @@
-"""Run folders (core/results.py), and the tables and curves made from them (plot.py, plots/)."""
+"""Run folders (store/folder.py), and the tables and curves made from them (plot.py, plots/)."""
 
 import csv
 import io
@@ -13,12 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import refused_by_plot, write_run
 from scipy import stats
 from synthetic import CONDITIONS, write_results
 
 import plot
-from core import results
-from plots import figures, grouping, paper, rewards, tables
+import tables
+from plots import figures, grouping, paper, rewards
+from store import folder as results
+from store import provenance
 
 ROOT = Path(__file__).parents[1]
 STEPS = 20_000
@@ -44,40 +47,9 @@ PAPER_ROWS = {
 }
 
 
-def write_run(root, task, algo, seed, result=None, overrides=None, evaluations=4, base=0.0, **config):
-    """A run with `evaluations` evaluations, finished with the mean return `result` unless that is None."""
-    overrides = overrides or {}
-    folder = results.run_folder(root, task, results.variant_name(algo, overrides), seed)
-    settings = {
-        "algo": algo,
-        "env": task,
-        "seed": str(seed),
-        "steps": STEPS,
-        "gamma": 0.99,
-        **overrides,
-        **config,
-    }
-    writer = results.RunWriter(folder, settings, {"commit": None}, eval_episodes=3)
-    rng = np.random.default_rng(seed)
-    for step in range(5_000, 5_000 * evaluations + 1, 5_000):
-        writer.append_evaluation(step, base + step / 1_000 + rng.normal(size=3), step / 100)
-    if result is not None:
-        writer.finish({"return_mean": result, "returns": [result] * 50})
-    return writer
-
-
 def records(root, table):
     with open(Path(root, "tables", f"{table}.csv"), newline="") as file:
         return list(csv.DictReader(file))
-
-
-def fails(capsys, *arguments):
-    """The one line with which plot.py refuses `arguments`."""
-    assert plot.main([str(argument) for argument in arguments]) == 2
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1
-    assert "Traceback" not in captured.err
-    return captured.err
 
 
 # ---- run folders ----
@@ -225,7 +197,7 @@ def test_corrupt_files_are_named_and_their_runs_skipped(tmp_path, capsys, name, 
 
 def test_description_of_the_environment(monkeypatch):
     command = ["/home/someone/repository/run.py", "algo=SRad", "results=/data/runs", "seed=0-9"]
-    info = results.describe_environment(command)
+    info = provenance.describe_environment(command)
     assert info["command"] == "run.py algo=SRad results=runs seed=0-9"
     assert info["versions"]["torch"] == torch.__version__
     assert info["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
@@ -233,7 +205,7 @@ def test_description_of_the_environment(monkeypatch):
     assert str(Path.home()) not in json.dumps(info) and str(ROOT) not in json.dumps(info)
 
     monkeypatch.setenv("PATH", "")
-    without_git = results.describe_environment(command)
+    without_git = provenance.describe_environment(command)
     assert without_git["commit"] is None and without_git["dirty"] is None
 
 
@@ -243,21 +215,21 @@ def test_description_names_the_commit(tmp_path, monkeypatch):
         command = ["git", "-C", str(tmp_path), *identity, *arguments]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
-    code = tmp_path / "results.py"
+    code = tmp_path / "provenance.py"
     code.write_text("first\n")
-    monkeypatch.setattr(results, "__file__", str(code))
+    monkeypatch.setattr(provenance, "__file__", str(code))
     (tmp_path / "other.py").write_text("")
     git("init")
     git("add", "other.py")
     git("commit", "-m", "without it", "--no-verify")
-    assert results.describe_environment([])["commit"] is None  # not a file of that repository
+    assert provenance.describe_environment([])["commit"] is None  # not a file of that repository
     git("add", ".")
     git("commit", "-m", "first", "--no-verify")
     git("tag", "-a", "v1", "-m", "a tag is not a commit's name")
-    info = results.describe_environment([])
+    info = provenance.describe_environment([])
     assert info["commit"] == git("rev-parse", "HEAD") and info["dirty"] is False
     code.write_text("second\n")
-    info = results.describe_environment([])
+    info = provenance.describe_environment([])
     assert info["commit"] == git("rev-parse", "HEAD") and info["dirty"] is True
 
 
@@ -633,25 +605,25 @@ def test_usage(capsys):
 
 
 def test_refusals(tmp_path, capsys):
-    assert "not a folder" in fails(capsys, tmp_path / "nowhere")
-    assert "no runs in" in fails(capsys, tmp_path)
+    assert "not a folder" in refused_by_plot(capsys, tmp_path / "nowhere")
+    assert "no runs in" in refused_by_plot(capsys, tmp_path)
     write_run(tmp_path, "W+M", "SRad", 0, result=1.0)
     write_run(tmp_path, "R+N", "DPre+", 0, result=1.0)
-    assert "'evn'" in (line := fails(capsys, tmp_path, "evn=W+M")) and "did you mean env?" in line
-    assert "did you mean SRad?" in (line := fails(capsys, tmp_path, "algo=srat")) and "DPre+" in line
-    assert "choices: R+N, W+M" in fails(capsys, tmp_path, "env=HC+O")
-    assert "choices: md, csv, tex, png, pdf" in fails(capsys, tmp_path, "format=jpg")
-    assert "given twice" in fails(capsys, tmp_path, "env=W+M", "env=R+N")
-    assert "expected env=value" in fails(capsys, tmp_path, "env=")
-    assert "expected one folder of results" in fails(capsys, tmp_path, "more")
-    assert "unexpected 'more'" in fails(capsys, "maps", "more")
-    assert "env= applies to a folder of results, not to tables" in fails(capsys, "tables", "env=W+M")
-    assert "choices: png, pdf" in fails(capsys, "maps", "format=md")
-    assert "expected one folder of results" in fails(capsys, "env=W+M")
-    assert "no readable runs" in fails(capsys, tmp_path, "env=W+M", "algo=DPre+")
+    assert "'evn'" in (line := refused_by_plot(capsys, tmp_path, "evn=W+M")) and "did you mean env?" in line
+    assert "did you mean SRad?" in (line := refused_by_plot(capsys, tmp_path, "algo=srat")) and "DPre+" in line
+    assert "choices: R+N, W+M" in refused_by_plot(capsys, tmp_path, "env=HC+O")
+    assert "choices: md, csv, tex, png, pdf" in refused_by_plot(capsys, tmp_path, "format=jpg")
+    assert "given twice" in refused_by_plot(capsys, tmp_path, "env=W+M", "env=R+N")
+    assert "expected key=value, got 'env='" in refused_by_plot(capsys, tmp_path, "env=")
+    assert "expected one folder of results" in refused_by_plot(capsys, tmp_path, "more")
+    assert "unexpected 'more'" in refused_by_plot(capsys, "maps", "more")
+    assert "env= applies to a folder of results, not to tables" in refused_by_plot(capsys, "tables", "env=W+M")
+    assert "choices: png, pdf" in refused_by_plot(capsys, "maps", "format=md")
+    assert "expected one folder of results" in refused_by_plot(capsys, "env=W+M")
+    assert "no readable runs" in refused_by_plot(capsys, tmp_path, "env=W+M", "algo=DPre+")
     blocked = tmp_path / "file"
     blocked.write_text("")
-    assert "file" in fails(capsys, tmp_path, f"out={blocked}")
+    assert "file" in refused_by_plot(capsys, tmp_path, f"out={blocked}")
     assert not (tmp_path / "tables").exists()
 
 

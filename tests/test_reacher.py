@@ -20,7 +20,7 @@ SAME_BITS = platform.machine() == "x86_64" and platform.libc_ver()[0] == "glibc"
 @pytest.fixture(params=["closed-form", "pybullet"])
 def robot(request):
     if request.param == "pybullet":
-        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python up to 3.11 only")
+        pytest.importorskip("pybullet", reason="PyBullet is not installed")
     robot = envs.make("R+N", simulator=request.param).robot
     yield robot
     robot.close()
@@ -28,7 +28,7 @@ def robot(request):
 
 @pytest.fixture
 def bullet():
-    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python up to 3.11 only")
+    pytest.importorskip("pybullet", reason="PyBullet is not installed")
     robot = PyBulletReacher()
     yield robot
     robot.close()
@@ -204,7 +204,7 @@ def test_a_simulator_that_is_not_there_is_one_clear_line(monkeypatch):
         with pytest.raises(envs.UnavailableError, match=message):
             envs.make(task, simulator="mujoco")
     monkeypatch.setitem(sys.modules, "pybullet", None)  # importing it fails
-    with pytest.raises(envs.UnavailableError, match=r"wheels for Python up to 3.11 \(this is Python 3\.") as error:
+    with pytest.raises(envs.UnavailableError, match=r"with Python up to 3.11 \(this is Python 3\.") as error:
         envs.make("R+N", simulator="pybullet")
     assert "\n" not in str(error.value)
     assert type(envs.make("R+N").robot) is type(envs.make("R+N", simulator="closed-form").robot) is Reacher
@@ -255,7 +255,7 @@ def pixel(x, y):
 @pytest.mark.parametrize("simulator", ["closed-form", "pybullet"])
 def test_a_picture_shows_arm_limit_and_target(simulator):
     if simulator == "pybullet":
-        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python up to 3.11 only")
+        pytest.importorskip("pybullet", reason="PyBullet is not installed")
     env = envs.make("R+N", render_mode="rgb_array", simulator=simulator)
     assert env.metadata == {"render_modes": ["rgb_array"], "render_fps": 61}
     obs, _ = env.reset(seed=0)

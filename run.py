@@ -13,17 +13,16 @@ from typing import Any
 import torch
 
 import envs
-from algos import ALGORITHMS, NFWPO
+from algos import ALGORITHMS, PAPER, paper_settings, setting_keys
 from constraints import ConstraintError
 from core.checkpoint import Checkpoint, CheckpointFolder, choose
 from core.config import (
     RUN_KEYS,
     Config,
     ConfigError,
-    defaults,
     differences,
+    keys_of,
     parse_arguments,
-    parse_seeds,
     resolve,
     saved_settings,
     split_names,
@@ -61,14 +60,12 @@ def usage() -> str:
         "  python run.py algo=all env=all seed=0-9 launcher=slurm slurm.hours=12    an array of Slurm jobs",
         "  python run.py status results/                      how all cells stand, running, queued or ended",
         "",
-        f"algo: {' '.join(ALGORITHMS)}, or all",
+        f"algo: {' '.join(ALGORITHMS)}, paper (the paper's 13) or all",
         f"env:  {' '.join(TASKS)}, or all",
         "",
         "keys (defaults depend on algorithm and task: the paper's hyperparameter table):",
     ]
-    for f in fields(Config):
-        if f.name not in ("algo", "env"):
-            lines.append(f"  {f.name:18s} {f.metadata['help']}")
+    lines += [f"  {key:18s} {f.metadata['help']}" for key, f in setting_keys().items() if key not in ("algo", "env")]
     lines += ["", "keys of a sweep (not part of any run's name):"]
     for schema, prefix in ((SweepSettings, ""), (SlurmSettings, SLURM_PREFIX)):
         lines += [f"  {prefix + f.name:18s} {f.metadata['help']}" for f in fields(schema)]
@@ -78,23 +75,20 @@ def usage() -> str:
 
 def plan(arguments: list[str]) -> list[tuple[Config, Config]]:
     """The cells that the arguments ask for, each as (configuration, the paper's configuration of the same cell)."""
-    overrides = parse_arguments(arguments)
+    overrides = parse_arguments(arguments, setting_keys())
     for key, choices in (("algo", ALGORITHMS), ("env", TASKS)):
         if key not in overrides:
             raise ConfigError(f"{key}= is missing (choices: {', '.join(choices)}, all)")
-    names = split_names("algorithm", overrides["algo"], ALGORITHMS)
+    names = split_names("algorithm", overrides["algo"], ALGORITHMS, {"paper": PAPER})
     tasks = split_names("task", overrides["env"], TASKS)
-    parse_seeds(overrides.get("seed", "0"))
-    bases = [_paper_config(name, task) for task in tasks for name in names]
+    bases = [paper_settings(name, task, TASKS[task].robot, TASKS[task].steps) for task in tasks for name in names]
     cells = []
     for base in bases:
         # A key that only some of several algorithms have is theirs alone; one that none has is a mistake.
         applicable = {
             key: text
             for key, text in overrides.items()
-            if key in ("algo", "env")
-            or getattr(base, key) is not None
-            or all(getattr(other, key) is None for other in bases)
+            if key in keys_of(base) or not any(key in keys_of(other) for other in bases)
         }
         cells.append((resolve(base, applicable), base))
     return cells
@@ -114,20 +108,6 @@ def device_name(device: str) -> str:
     return device if device == "cpu" else torch.cuda.get_device_name(device)
 
 
-def _paper_config(name: str, task: str) -> Config:
-    algorithm = ALGORITHMS[name]
-    return defaults(
-        algo=name,
-        env=task,
-        robot=TASKS[task].robot.__name__,
-        base=algorithm.base,
-        mapping=algorithm.mapping,
-        frank_wolfe=issubclass(algorithm.agent, NFWPO),
-        penalty=algorithm.penalty,
-        steps=TASKS[task].steps,
-    )
-
-
 def make_trainer(
     config: Config,
     seeds: list[int],
@@ -139,17 +119,10 @@ def make_trainer(
 
     ConfigError where networks and replay buffer do not fit into memory.
     """
-    algorithm = ALGORITHMS[config.algo]
     train_envs = [envs.make(config.env) for _ in seeds]
     try:
-        agent = algorithm.agent(
-            config,
-            envs.constraint(config.env),
-            train_envs[0].observation_space.shape[0],
-            seeds,
-            mapping=algorithm.mapping,
-            placement=algorithm.placement,
-        )
+        obs_dim = train_envs[0].observation_space.shape[0]
+        agent = ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, seeds)
         return Trainer(config, agent, train_envs, lambda: envs.make(config.env), writers, progress, check)
     except RuntimeError as error:
         if not any(words in str(error) for words in ("allocate memory", "out of memory")):
@@ -191,7 +164,7 @@ def train(config: Config, base: Config, check: Callable[[], None] = lambda: None
             file=sys.stderr,
         )
     variant = variant_name(config.algo, differences(config, base))
-    folders = {seed: run_folder(config.results, config.env, variant, seed) for seed in parse_seeds(config.seed)}
+    folders = {seed: run_folder(config.results, config.env, variant, seed) for seed in config.seeds}
     with ExitStack() as locks:
         for folder in folders.values():
             locks.enter_context(run_lock(folder))

@@ -39,7 +39,7 @@ import run
 from algos import ALGORITHMS
 from bench.common import TASK, fill_replay, machine, make_agent, parse_options, positive, positives
 from core.config import ConfigError, split_names
-from core.graph import GradientSteps
+from core.cuda_graph import GradientSteps
 from plots.runtime import COLUMNS, runtime_table
 from plots.tables import to_terminal
 

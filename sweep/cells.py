@@ -19,7 +19,7 @@ from typing import Any
 
 from core import slurm
 from core.checkpoint import saved_step
-from core.config import Config, differences, parse_seeds
+from core.config import Config, differences
 from core.lock import lock_owner
 from core.results import (
     describe_failure,
@@ -95,7 +95,7 @@ class Cell:
 def cell_of(config: Config, base: Config) -> Cell:
     """The cell of a configuration; `base` is the paper's of the same algorithm and task."""
     variant = variant_name(config.algo, differences(config, base))
-    return Cell(Path(config.results).expanduser(), config.env, variant, tuple(parse_seeds(config.seed)))
+    return Cell(Path(config.results).expanduser(), config.env, variant, config.seeds)
 
 
 def command_words(config: Config, base: Config) -> list[str]:

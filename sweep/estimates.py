@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from algos import ALGORITHMS
-from core.agent import stores_centers
 from core.config import Config
 from core.results import Run
 from envs import TASKS
@@ -53,12 +52,14 @@ def _rates() -> dict[tuple[str, str], Rate]:
 
 @cache
 def _rate(task: str, algo: str) -> Rate:
-    """The cell's own, or for a task or an algorithm that is not in the table what is typical of its robot and base."""
+    """The measured rate of this cell. For an unknown cell: the mean over those with the same robot and family."""
     if (task, algo) in _rates():
         return _rates()[task, algo]
 
+    families = {name: algorithm.agent.family for name, algorithm in ALGORITHMS.items()}
+
     def alike(other_task: str, other_algo: str) -> bool:
-        return TASKS[other_task].robot == TASKS[task].robot and ALGORITHMS[other_algo].base == ALGORITHMS[algo].base
+        return TASKS[other_task].robot == TASKS[task].robot and families[other_algo] == families[algo]
 
     near = [rate for key, rate in _rates().items() if alike(*key)] or list(_rates().values())
     return Rate(*map(statistics.mean, zip(*near, strict=True)))
@@ -71,7 +72,7 @@ def seconds(config: Config, base: Config, seeds: int, start: int = 0) -> float:
     step = 1e-3 * rate.step_ms * (seeds + STEP_OVERHEAD) / (SEEDS + STEP_OVERHEAD)
     update = 1e-3 * rate.update_ms * (seeds + UPDATE_OVERHEAD) / (SEEDS + UPDATE_OVERHEAD)
     update *= (config.batch_size + BATCH_OVERHEAD) / (base.batch_size + BATCH_OVERHEAD)
-    rollout = robot.max_episode_steps if config.train_freq == "episode" else int(config.train_freq)
+    rollout = config.train_freq if isinstance(config.train_freq, int) else robot.max_episode_steps
     per_step = 1.0 if config.gradient_steps == -1 else config.gradient_steps / rollout
     updates = per_step * (config.steps - max(start, config.learning_starts))
     evaluations = config.steps // config.eval_every - start // config.eval_every
@@ -84,7 +85,7 @@ def memory(config: Config, seeds: int) -> float:
     """Bytes, with the replay buffer as full as it gets."""
     task, algorithm = TASKS[config.env], ALGORITHMS[config.algo]
     robot: Any = task.robot
-    centers = 2 if stores_centers(algorithm.mapping, task.constraint) else 0
+    centers = 2 if algorithm.map.stores_centers(task.constraint) else 0
     width = 2 * robot.obs_dim + (1 + centers) * robot.action_dim + 2
     simulators = (1 + config.eval_episodes) * SIMULATOR_BYTES.get(robot.__name__, 0.0)
     return PROCESS_BYTES + seeds * (SEED_BYTES + simulators + 4.0 * width * min(config.buffer_size, config.steps))

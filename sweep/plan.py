@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
+from algos import saved_config
 from core.config import Config
 from core.results import Run, read_results
 from plots.tables import Table, text_cells, to_terminal
@@ -63,8 +64,7 @@ def make_plan(cells: Sequence[tuple[Config, Config]], jobs: Mapping[str, str]) -
 
 
 def _config_of(run: Run) -> Config:
-    names = {f.name for f in fields(Config)}
-    return Config(**{"env": run.task, "algo": run.algo} | {k: v for k, v in run.config.items() if k in names})
+    return saved_config(run.config | {"env": run.task, "algo": run.algo})
 
 
 def describe_plan(entries: Sequence[Entry], jobs: int) -> str:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, fields
 
 from omegaconf import OmegaConf
 
-from core.config import Config, ConfigError, choose, override
+from algos import setting_keys
+from core.config import ConfigError, choose, override
 
 SLURM_PREFIX = "slurm."
 LAUNCHERS = ("local", "slurm")
@@ -66,7 +67,7 @@ def parse_sweep(arguments: Sequence[str]) -> tuple[Sweep, list[str]]:
         name = key.removeprefix(SLURM_PREFIX)
         if equals and not key.startswith(SLURM_PREFIX):
             # Here, where all keys are known, so that a misspelt one is told of all choices.
-            choose("key", key, [*(f.name for f in fields(Config)), *own, *(SLURM_PREFIX + n for n in slurm_names)])
+            choose("key", key, [*setting_keys(), *own, *(SLURM_PREFIX + n for n in slurm_names)])
         if key not in own and not key.startswith(SLURM_PREFIX):
             words.append(word)
             continue

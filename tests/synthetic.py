@@ -12,13 +12,13 @@ if __name__ == "__main__":
 import numpy as np
 from tqdm import tqdm
 
-from core.config import defaults, saved_settings
+from algos import paper_settings
+from core.config import saved_settings
 from core.results import RunWriter, run_folder, variant_name
+from envs import TASKS
 from plots.paper import COLORS, DEFAULT_BATCH, FAMILIES, read_paper
 
 CONDITIONS = list(dict.fromkeys((task, batch) for task, batch, _ in read_paper()))
-MAPPINGS = {"Alpha": "alpha", "Rad": "radial"}
-ROBOTS = {"R": "Reacher", "HC": "HalfCheetah", "H": "Hopper", "W": "Walker2d"}
 
 
 def write_results(root, conditions=CONDITIONS, algos=tuple(COLORS), seeds=10, evaluations=None):
@@ -28,14 +28,10 @@ def write_results(root, conditions=CONDITIONS, algos=tuple(COLORS), seeds=10, ev
     """
     rng = np.random.default_rng(0)
     for task, batch in tqdm(conditions, disable=None):
-        robot = ROBOTS[task.split("+")[0]]
         paper = {algo: stat for (name, size, algo), stat in read_paper().items() if (name, size) == (task, batch)}
         mean_of_row = np.mean([stat.mean for stat in paper.values()])
         for algo in algos:
-            base = "SAC" if algo in FAMILIES["SAC family"] else "TD3"
-            steps = 300_000 if robot == "Reacher" else 1_000_000
-            mapping = MAPPINGS.get(algo[1:], "project")
-            config = defaults(algo, task, robot, base, mapping, algo == "NFW", algo.endswith("+"), steps)
+            config = paper_settings(algo, task, TASKS[task].robot, TASKS[task].steps)
             overrides = {} if batch == DEFAULT_BATCH else {"batch_size": int(batch)}
             for key, value in overrides.items():
                 setattr(config, key, value)
@@ -44,13 +40,13 @@ def write_results(root, conditions=CONDITIONS, algos=tuple(COLORS), seeds=10, ev
                 folder = run_folder(root, task, variant_name(algo, overrides), seed)
                 writer = RunWriter(folder, saved_settings(config, seed), {"commit": None}, config.eval_episodes)
                 final = rng.normal(mean, spread)
-                for i in range(1, (evaluations or steps // config.eval_every) + 1):
+                for i in range(1, (evaluations or config.steps // config.eval_every) + 1):
                     step = i * config.eval_every
-                    risen = final * (1 - np.exp(-6 * step / steps))
+                    risen = final * (1 - np.exp(-6 * step / config.steps))
                     writer.append_evaluation(step, risen + spread * rng.normal(size=config.eval_episodes), step / 100)
-                    if base == "SAC" and step > config.learning_starts:
-                        measures = {"temperature": np.exp(-5 * step / steps + 0.1 * rng.normal()), "entropy": -2.0}
-                        writer.append_statistics(step, measures)
+                    if algo in FAMILIES["SAC family"] and step > config.learning_starts:
+                        temperature = np.exp(-5 * step / config.steps + 0.1 * rng.normal())
+                        writer.append_statistics(step, {"temperature": temperature, "entropy": -2.0})
                 writer.finish({"return_mean": final, "returns": final + spread * rng.normal(size=50)})
 
 

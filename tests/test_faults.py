@@ -18,11 +18,12 @@ import torch
 from test_resume import Breaks, assert_identical, outcome, train, train_through
 
 import run
-from core import config, results
+from algos.td3 import TD3
+from core import results
 from core.checkpoint import Checkpoint, CheckpointFolder, choose
 from core.interrupt import Interrupted
 from core.lock import LockedError, run_lock
-from core.replay import Replay
+from core.replay import Batch, Replay
 
 ROOT = Path(__file__).parents[1]
 WORDS = (
@@ -164,7 +165,7 @@ def test_replay_files_hold_each_transition_once_and_go_when_it_is_overwritten(tm
     folder, replay = CheckpointFolder(tmp_path), Replay([1, 2], 50, obs_dim=2, action_dim=1, centers=False)
     kept_files = []
     for number in range(130):
-        replay.add([1], *(torch.full((2, width), float(number)) for width in replay.widths))
+        replay.add([1], Batch(*(torch.full((2, width), float(number)) for width in replay.widths)))
         if number % 20 == 19:
             folder.write("moment", (2,), number, {}, {"number": number}, replay, 1)
             folder.keep()
@@ -199,7 +200,7 @@ def test_checkpoints_after_a_resumption_join_those_before_it(tmp_path):
 
 def test_settings_that_changed_are_not_mixed(tmp_path, capsys, monkeypatch):
     folder, _ = break_off(tmp_path)
-    monkeypatch.setitem(config.HYPERPARAMETERS["Reacher", "TD3"], "tau", 0.5)
+    monkeypatch.setitem(TD3.paper["Reacher"], "tau", 0.5)
     capsys.readouterr()
     assert run.main([*WORDS.split(), f"results={tmp_path}"]) == 2
     err = capsys.readouterr().err

@@ -28,13 +28,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from core.config import ConfigError, choose, split_names
-from core.results import find_runs, parse_variant, read_results
 from plots import style, tables
 from plots.aggregates import aggregate, draw_aggregates, improvement_table, mean_table
 from plots.figures import draw_curves
 from plots.grouping import Groups, group_runs, list_left_out
 from plots.paper import order_algos, order_tasks
 from plots.rewards import comparison_table, reward_table
+from store.folder import find_runs, parse_variant, read_results
 
 RESULTS = "results"
 RUNTIME = "bench/results/runtime.csv"

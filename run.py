@@ -15,7 +15,6 @@ import torch
 import envs
 from algos import ALGORITHMS, PAPER, paper_settings, setting_keys
 from constraints import ConstraintError
-from core.checkpoint import Checkpoint, CheckpointFolder, choose
 from core.config import (
     RUN_KEYS,
     Config,
@@ -27,22 +26,23 @@ from core.config import (
     saved_settings,
     split_names,
 )
-from core.interrupt import Interrupted, Interrupts
-from core.lock import LockedError, run_lock
-from core.results import (
+from core.trainer import Trainer
+from envs import TASKS, TOLERANCE
+from store.checkpoint import Checkpoint, CheckpointFolder, group_checkpoints
+from store.files import one_line
+from store.folder import (
     RunWriter,
-    describe_environment,
     describe_failure,
     has_ended,
     has_failed,
     lockstep_group,
-    one_line,
     read_run,
     run_folder,
     variant_name,
 )
-from core.trainer import Trainer
-from envs import TASKS, TOLERANCE
+from store.interrupt import Interrupted, Interrupts
+from store.lock import LockedError, run_lock
+from store.provenance import describe_environment
 from sweep.launch import launch
 from sweep.settings import SLURM_PREFIX, SlurmSettings, SweepSettings, parse_sweep
 from sweep.status import describe_status
@@ -210,7 +210,7 @@ def _find_checkpoints(folders: dict[int, Path], ended: set[int]) -> tuple[list[d
             print(problem, file=sys.stderr)
         intact[seed] = checkpoints
         started[seed] = checkpoints[0].group if checkpoints else lockstep_group(folder)
-    groups, fresh = choose(intact, started)
+    groups, fresh = group_checkpoints(intact, started)
     return groups, [seed for seed in fresh if seed not in ended]
 
 

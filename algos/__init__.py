@@ -14,7 +14,7 @@ from algos.td3 import TD3
 from constraints import Constraint
 from core.agent import Agent
 from core.config import Config, PenaltyConfig, keys_of, restore_settings
-from core.maps import Alpha, Map, Placement, Project, Radial
+from core.maps import Alpha, Gauge, Map, Placement, Project, Radial
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,11 @@ ALGORITHMS: dict[str, Algorithm] = {
 
 PAPER = tuple(ALGORITHMS)
 """The names of the paper."""
+
+ALGORITHMS |= {
+    "DGauge": Algorithm(TD3, Gauge(), "layer"),
+    "SGauge": Algorithm(SAC, Gauge(), "layer"),
+}
 
 
 def paper_settings(name: str, task: str, robot: Any, steps: int) -> Config:

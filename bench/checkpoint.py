@@ -24,9 +24,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import torch
 
 import run
-from core.checkpoint import CheckpointFolder
 from core.config import saved_settings
-from core.results import RunWriter
+from store.checkpoint import CheckpointFolder
+from store.folder import RunWriter
 
 
 def megabytes(folder: Path) -> float:

@@ -14,7 +14,7 @@ from core.agent import Agent
 from core.config import ConfigError, choose
 from core.random import stream_seed
 from core.replay import Batch, Replay
-from core.results import processor
+from store.provenance import processor
 
 TASK = "HC+O"
 

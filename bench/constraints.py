@@ -48,9 +48,9 @@ from constraints import (
     WeightedPositivePart,
 )
 from core.config import ConfigError, choose, split_names
-from core.results import processor
 from envs import TASKS
 from envs.reacher import Reacher
+from store.provenance import processor
 
 Operation = Callable[[Tensor, Tensor], Tensor]
 """(obs (batch, n), action (batch, d)) -> the operation's result (batch, d)."""

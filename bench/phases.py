@@ -29,7 +29,7 @@ import algos.td3
 import run
 from bench.common import TASK
 from core.config import saved_settings
-from core.results import RunWriter
+from store.folder import RunWriter
 
 STEPS, WARM_UP = 10_000, 9_500
 """Environment steps of each seed, and those before the first gradient step."""

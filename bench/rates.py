@@ -26,8 +26,8 @@ from tqdm import tqdm
 import core.trainer
 import run
 from core.config import Config, ConfigError, choose, saved_settings
-from core.interrupt import Interrupted
-from core.results import RunWriter
+from store.folder import RunWriter
+from store.interrupt import Interrupted
 from sweep.estimates import COLUMNS, RATES, SEEDS
 
 WARM_UP, UPDATES = 100, 20

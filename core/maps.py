@@ -101,7 +101,7 @@ class RayMap(Map):
 
     entropy: str = setting(
         "paper",
-        "alpha and radial maps with SAC: entropy of actions as in the 'paper', or in unit-'ball' coordinates",
+        "SAlpha, SRad, SGauge: entropy of actions as in the 'paper', or in unit-'ball' coordinates",
         one_of("paper", "ball"),
         of_density=True,
     )
@@ -148,3 +148,19 @@ class Radial(RayMap):
     ) -> tuple[Tensor, Tensor]:
         ray = constraint.ray(obs, sample.suggested, center)
         return ray.radial_map(), ray.radial_log_prob(sample.log_prob, self.unit_ball, self.log_det_floor)
+
+
+@dataclass
+class Gauge(RayMap):
+    """The gauge map (Tabas and Zhang, 2022): it scales the box onto the set, ray by ray."""
+
+    squashes = True
+
+    def __call__(self, constraint: Constraint, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
+        return constraint.gauge_map(obs, suggested, center)
+
+    def with_log_prob(
+        self, constraint: Constraint, obs: Tensor, sample: Sample, center: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        ray = constraint.ray(obs, sample.suggested, center)
+        return ray.gauge_map(), ray.gauge_log_prob(sample.log_prob, self.unit_ball)

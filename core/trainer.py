@@ -12,6 +12,7 @@ import time
 import uuid
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -20,15 +21,16 @@ import torch
 from tqdm import tqdm
 
 from core.agent import Agent
-from core.checkpoint import Checkpoint, CheckpointFolder
 from core.config import Config
 from core.cuda_graph import GradientSteps
 from core.evaluation import Evaluator
-from core.interrupt import Interrupted
 from core.random import stream_seed
 from core.replay import Batch, Replay
-from core.results import RunWriter, has_failed, is_finished, one_line
 from envs import InfeasibleActionError, step_together
+from store.checkpoint import Checkpoint, CheckpointFolder
+from store.files import one_line
+from store.folder import RunWriter, has_failed, is_finished
+from store.interrupt import Interrupted
 
 COUNTERS = ("steps", "rollout_steps", "owed", "gradient_steps", "evaluated")
 
@@ -337,7 +339,8 @@ class Trainer:
             try:
                 for i, folder in enumerate(self.checkpoints):
                     settings = self.writers[i].config
-                    folder.write(moment, self.seeds, self.steps[i], settings, self._state(i), self.replay, i)
+                    stored = partial(self.replay.stretch, i), self._oldest(i), self.replay.added[i]
+                    folder.write(moment, self.seeds, self.steps[i], settings, self._state(i), *stored)
                 for folder in self.checkpoints:
                     folder.keep()
             except OSError as error:
@@ -382,7 +385,7 @@ class Trainer:
             self.evaluator.set_state(i, state["evaluator"])
             self.replay.added[i] = state["added"]
             self.replay.streams.generators[i].set_state(state["sampling"])
-            checkpoint.fill(self.replay, i)
+            checkpoint.fill(partial(self.replay.stretch, i), self._oldest(i))
             self.checkpoints[i].resume(checkpoint)
             self.writers[i].restore_tables(state["tables"])
             if self.best[i]:
@@ -394,6 +397,10 @@ class Trainer:
         self.seconds, self.started = state["seconds"], time.perf_counter() - total
         self.steps_at_checkpoint = sum(self.steps)
         self.began = True
+
+    def _oldest(self, i: int) -> int:
+        """The first transition of the seed in position i that the replay buffer still holds."""
+        return max(0, self.replay.added[i] - self.replay.capacity)
 
     def _elapsed(self) -> float:
         """Seconds of training so far, without the time between an end and a resumption."""

@@ -17,10 +17,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
 
-from core.results import Run
 from plots.grouping import Condition, Groups, order_conditions
 from plots.paper import PAPER_SEEDS, order_algos
 from plots.style import color_of, line_of, plain, save
+from store.folder import Run
 
 LOGARITHMIC = ("temperature",)
 """Training measures that change by orders of magnitude."""

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from core.config import RUN_KEYS
-from core.results import Run, describe_failure
 from plots.paper import Statistic, order_algos, order_tasks
+from store.folder import Run, describe_failure
 
 
 class Condition(NamedTuple):

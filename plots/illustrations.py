@@ -19,9 +19,9 @@ from algos import ALGORITHMS, saved_config
 from constraints import Constraint, LinearConstraint
 from core.config import ConfigError
 from core.random import stream_seed
-from core.results import Run, find_runs, read_run
 from plots.paper import order_tasks
 from plots.style import plain, save
+from store.folder import Run, find_runs, read_run
 
 SET_COLOR, POINT_COLORS = "#cfe0f3", ("#b8520a", "#1e6b26")
 # Both are nearest to the same corner, so the projection cannot tell them apart and its gradient is zero.

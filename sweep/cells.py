@@ -17,21 +17,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from core import slurm
-from core.checkpoint import saved_step
 from core.config import Config, differences
-from core.lock import lock_owner
-from core.results import (
+from store import slurm
+from store.checkpoint import saved_step
+from store.files import replace_file
+from store.folder import (
     describe_failure,
     has_ended,
     has_failed,
     last_evaluated,
     parse_variant,
     read_run,
-    replace_file,
     run_folder,
     variant_name,
 )
+from store.lock import lock_owner
 
 RECORDS = "sweep"
 """The folder of logs and records in that of results."""

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from core.config import Config, ConfigError, choose
-from core.lock import LockedError, run_lock
-from core.results import one_line
-from core.slurm import cluster
+from store.files import one_line
+from store.lock import LockedError, run_lock
+from store.slurm import cluster
 from sweep.cells import NO_ANSWER, RECORDS, cell_of, command_words, job_states
 from sweep.plan import Entry, count_states, make_plan
 from sweep.settings import SIGNAL_DELAY, SlurmSettings, Sweep

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 from algos import ALGORITHMS
 from core.config import Config
-from core.results import Run
 from envs import TASKS
+from store.folder import Run
 
 RATES = Path(__file__).with_name("rates.csv")
 COLUMNS = ("task", "algo", "update_ms", "step_ms")

@@ -11,9 +11,10 @@ from typing import Any
 from submitit import JobEnvironment
 from submitit.helpers import Checkpointable
 
-from core import slurm
-from core.checkpoint import saved_step
-from core.results import has_ended, one_line
+from store import slurm
+from store.checkpoint import saved_step
+from store.files import one_line
+from store.folder import has_ended
 from sweep.cells import Cell
 
 PATIENCE = 40.0

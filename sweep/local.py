@@ -13,8 +13,8 @@ from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from datetime import datetime
 from pathlib import Path
 
-from core.interrupt import Interrupted
-from core.results import one_line
+from store.files import one_line
+from store.interrupt import Interrupted
 from sweep.cells import command_words, format_seeds, reason_of
 from sweep.plan import Entry, describe_state
 from sweep.progress import Display, End

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from algos import saved_config
 from core.config import Config
-from core.results import Run, read_results
 from plots.tables import Table, text_cells, to_terminal
+from store.folder import Run, read_results
 from sweep import estimates
 from sweep.cells import Cell, State, cell_of, format_seeds, reached, shorten, state_of
 

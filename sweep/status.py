@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from core.config import ConfigError, parse_seeds
-from core.results import find_runs, has_ended, read_settings
 from plots.tables import Table, text_cells, to_terminal
+from store.folder import find_runs, has_ended, read_settings
 from sweep.cells import NO_ANSWER, RECORDS, Cell, State, format_seeds, job_states, reached, shorten, state_of
 from sweep.plan import count_states, describe_state, list_details
 

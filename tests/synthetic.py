@@ -14,9 +14,9 @@ from tqdm import tqdm
 
 from algos import paper_settings
 from core.config import saved_settings
-from core.results import RunWriter, run_folder, variant_name
 from envs import TASKS
 from plots.paper import COLORS, DEFAULT_BATCH, FAMILIES, read_paper
+from store.folder import RunWriter, run_folder, variant_name
 
 CONDITIONS = list(dict.fromkeys((task, batch) for task, batch, _ in read_paper()))
 

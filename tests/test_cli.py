@@ -13,8 +13,8 @@ import yaml
 import run
 from algos import ALGORITHMS, PAPER, setting_keys
 from core.config import ConfigError, parse_seeds
-from core.results import read_run
 from envs import TASKS
+from store.folder import read_run
 
 ROOT = Path(__file__).parents[1]
 SHORT = ["steps=40", "learning_starts=20", "batch_size=8", "hidden=[16,16]", "eval_episodes=1", "final_episodes=2"]

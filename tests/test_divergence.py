@@ -12,9 +12,9 @@ import envs
 import run
 from algos import ALGORITHMS
 from core.random import stream_seed
-from core.results import read_results, read_run
 from envs import ActionConstrainedEnv
 from plots.grouping import count_failed, group_runs, list_left_out
+from store.folder import read_results, read_run
 
 WORDS = (
     "seed=3,5,8 steps=120 learning_starts=40 batch_size=8 hidden=[8,8] eval_every=60 eval_episodes=1 final_episodes=1"

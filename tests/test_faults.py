@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,11 +20,11 @@ from test_resume import Breaks, assert_identical, outcome, train, train_through
 
 import run
 from algos.td3 import TD3
-from core import results
-from core.checkpoint import Checkpoint, CheckpointFolder, choose
-from core.interrupt import Interrupted
-from core.lock import LockedError, run_lock
 from core.replay import Batch, Replay
+from store import folder as results
+from store.checkpoint import Checkpoint, CheckpointFolder, group_checkpoints
+from store.interrupt import Interrupted
+from store.lock import LockedError, run_lock
 
 ROOT = Path(__file__).parents[1]
 WORDS = (
@@ -157,7 +158,7 @@ A, B = (1, 2, 3), (4, 5)
 )
 def test_seeds_are_taken_up_at_a_moment_that_they_share(intact, moments, fresh):
     started = {seed: A if seed in A else B if seed in B else () for seed in intact}
-    groups, chosen_fresh = choose(intact, started)
+    groups, chosen_fresh = group_checkpoints(intact, started)
     assert [{seed: c.moment for seed, c in group.items()} for group in groups] == moments and chosen_fresh == fresh
 
 
@@ -167,7 +168,8 @@ def test_replay_files_hold_each_transition_once_and_go_when_it_is_overwritten(tm
     for number in range(130):
         replay.add([1], Batch(*(torch.full((2, width), float(number)) for width in replay.widths)))
         if number % 20 == 19:
-            folder.write("moment", (2,), number, {}, {"number": number}, replay, 1)
+            stored = partial(replay.stretch, 1), max(0, replay.added[1] - 50), replay.added[1]
+            folder.write("moment", (2,), number, {}, {"number": number}, *stored)
             folder.keep()
             kept_files.append(sorted(path.name for path in (tmp_path / "checkpoint").glob("*.f32")))
     assert kept_files[:3] == [["replay-0-20.f32"]] * 1 + [
@@ -180,7 +182,7 @@ def test_replay_files_hold_each_transition_once_and_go_when_it_is_overwritten(tm
     for checkpoint, stop in ((newest_one, 120), (before, 100)):
         again = Replay([1, 2], 50, obs_dim=2, action_dim=1, centers=False)
         again.added[1] = stop
-        checkpoint.fill(again, 1)
+        checkpoint.fill(partial(again.stretch, 1), max(0, again.added[1] - 50))
         assert checkpoint.state() == {"number": stop - 1}
         assert sorted(again.rows[50:, 0].tolist()) == list(range(stop - 50, stop))
         assert again.rows[50 + (stop - 1) % 50].eq(stop - 1).all()
@@ -407,7 +409,7 @@ def script(code):
 def test_a_second_signal_ends_the_process_at_once():
     done = script(
         "import os, signal\n"
-        "from core.interrupt import Interrupted, Interrupts\n"
+        "from store.interrupt import Interrupted, Interrupts\n"
         "with Interrupts() as interrupts:\n"
         "    interrupts.check()\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
@@ -424,7 +426,7 @@ def test_a_second_signal_ends_the_process_at_once():
 def test_handlers_are_put_back_and_an_ignored_signal_stays_ignored():
     done = script(
         "import os, signal\n"
-        "from core.interrupt import Interrupts\n"
+        "from store.interrupt import Interrupts\n"
         "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
         "with Interrupts() as interrupts:\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"

@@ -16,10 +16,10 @@ import run
 from algos import ALGORITHMS
 from constraints import LinearConstraint
 from core.cuda_graph import EAGER_STEPS, GradientSteps
-from core.interrupt import Interrupted
 from core.random import Tape
 from core.replay import Batch, Replay
-from core.results import read_run
+from store.folder import read_run
+from store.interrupt import Interrupted
 
 SEEDS = [3, 8]
 BATCH = 16

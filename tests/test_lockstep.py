@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from core.replay import Replay
-from core.results import RunWriter
 from run import make_trainer, plan
+from store.folder import RunWriter
 
 
 class RecordingReplay(Replay):

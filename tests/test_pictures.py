@@ -17,8 +17,8 @@ import envs
 import plot
 import run
 from algos import ALGORITHMS
-from core.results import read_run
 from plots import definitions, illustrations, runtime, tables
+from store.folder import read_run
 
 ROOT = Path(__file__).parents[1]
 

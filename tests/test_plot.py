@@ -1,4 +1,4 @@
-"""Run folders (core/results.py), and the tables and curves made from them (plot.py, plots/)."""
+"""Run folders (store/folder.py), and the tables and curves made from them (plot.py, plots/)."""
 
 import csv
 import io
@@ -17,8 +17,9 @@ from scipy import stats
 from synthetic import CONDITIONS, write_results
 
 import plot
-from core import results
 from plots import figures, grouping, paper, rewards, tables
+from store import folder as results
+from store import provenance
 
 ROOT = Path(__file__).parents[1]
 STEPS = 20_000
@@ -225,7 +226,7 @@ def test_corrupt_files_are_named_and_their_runs_skipped(tmp_path, capsys, name, 
 
 def test_description_of_the_environment(monkeypatch):
     command = ["/home/someone/repository/run.py", "algo=SRad", "results=/data/runs", "seed=0-9"]
-    info = results.describe_environment(command)
+    info = provenance.describe_environment(command)
     assert info["command"] == "run.py algo=SRad results=runs seed=0-9"
     assert info["versions"]["torch"] == torch.__version__
     assert info["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
@@ -233,7 +234,7 @@ def test_description_of_the_environment(monkeypatch):
     assert str(Path.home()) not in json.dumps(info) and str(ROOT) not in json.dumps(info)
 
     monkeypatch.setenv("PATH", "")
-    without_git = results.describe_environment(command)
+    without_git = provenance.describe_environment(command)
     assert without_git["commit"] is None and without_git["dirty"] is None
 
 
@@ -243,21 +244,21 @@ def test_description_names_the_commit(tmp_path, monkeypatch):
         command = ["git", "-C", str(tmp_path), *identity, *arguments]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
-    code = tmp_path / "results.py"
+    code = tmp_path / "provenance.py"
     code.write_text("first\n")
-    monkeypatch.setattr(results, "__file__", str(code))
+    monkeypatch.setattr(provenance, "__file__", str(code))
     (tmp_path / "other.py").write_text("")
     git("init")
     git("add", "other.py")
     git("commit", "-m", "without it", "--no-verify")
-    assert results.describe_environment([])["commit"] is None  # not a file of that repository
+    assert provenance.describe_environment([])["commit"] is None  # not a file of that repository
     git("add", ".")
     git("commit", "-m", "first", "--no-verify")
     git("tag", "-a", "v1", "-m", "a tag is not a commit's name")
-    info = results.describe_environment([])
+    info = provenance.describe_environment([])
     assert info["commit"] == git("rev-parse", "HEAD") and info["dirty"] is False
     code.write_text("second\n")
-    info = results.describe_environment([])
+    info = provenance.describe_environment([])
     assert info["commit"] == git("rev-parse", "HEAD") and info["dirty"] is True
 
 

@@ -9,9 +9,9 @@ from scipy import stats
 from test_plot import write_run
 
 import plot
-from core.results import read_results
 from plots import statistics
 from plots.grouping import group_runs
+from store.folder import read_results
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import run
-from core.interrupt import Interrupted
-from core.results import find_runs, read_run
+from store.folder import find_runs, read_run
+from store.interrupt import Interrupted
 
 SETTINGS = "steps=240 learning_starts=60 batch_size=8 hidden=[16,16] eval_every=100 eval_episodes=1 final_episodes=1"
 CASES = {

@@ -17,9 +17,9 @@ import pytest
 from test_resume import assert_identical, outcome_of
 
 import run
-from core.checkpoint import saved_step
-from core.results import find_runs, is_finished
-from core.slurm import queue
+from store.checkpoint import saved_step
+from store.folder import find_runs, is_finished
+from store.slurm import queue
 from sweep.cells import state_of
 from sweep.status import find_cells
 

@@ -14,12 +14,12 @@ from test_resume import assert_identical, outcome_of
 
 import plot
 import run
-from core import slurm
-from core.checkpoint import saved_step
 from core.config import parse_seeds
-from core.interrupt import Interrupted, Interrupts
-from core.lock import LockedError, lock_owner, run_lock
-from core.results import find_runs
+from store import slurm
+from store.checkpoint import saved_step
+from store.folder import find_runs
+from store.interrupt import Interrupted, Interrupts
+from store.lock import LockedError, lock_owner, run_lock
 from sweep import estimates
 from sweep.cells import Cell, cell_of, command_words, format_seeds, job_states, state_of
 from sweep.plan import make_plan

@@ -17,8 +17,8 @@ from core.agent import Agent
 from core.config import Config
 from core.maps import Alpha
 from core.random import Streams
-from core.results import RunWriter, is_finished, read_run
 from core.trainer import Trainer
+from store.folder import RunWriter, is_finished, read_run
 
 OBS, DIM = 3, 2
 LENGTHS = (5, 7)  # of every other episode; the shorter ones terminate, the longer ones are cut off

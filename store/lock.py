@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from core import slurm
+from store import slurm
 
 
 class LockedError(RuntimeError):

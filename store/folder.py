@@ -8,9 +8,9 @@
         best.pt last.pt  state dicts
         result.json      the final evaluation; written last, so its presence means that the run is finished
         failed.json      in its place where the run diverged: at which step, what was not finite, last evaluation
-        checkpoint/      while the run is unfinished: see core/checkpoint.py
+        checkpoint/      while the run is unfinished: see store/checkpoint.py
     results/<task>/<variant>/seed=<n>.lock
-                         while a process trains the run: its process id, host and Slurm job; see core/lock.py
+                         while a process trains the run: its process id, host and Slurm job; see store/lock.py
     results/sweep/       logs and records of sweeps: see sweep/cells.py
 
 `<variant>` is the algorithm's name followed by `,key=value` for each setting that differs from the paper's
@@ -22,24 +22,19 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import re
-import shlex
-import subprocess
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime, timezone
-from importlib import metadata
 from operator import methodcaller
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
 
+from store.files import one_line, replace_file
+
 _TABLES = ("evaluations.csv", "training.csv")
-_PACKAGES = ("torch", "numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omegaconf")
 # libyaml's loader is some ten times faster, which counts with two thousand runs; not every wheel has it.
 _YamlLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -106,51 +101,6 @@ def lockstep_group(folder: str | Path) -> tuple[int, ...]:
         return tuple(_parse(Path(folder, "info.json"), json.loads)["lockstep"])
     except (ValueError, KeyError, TypeError):
         return ()
-
-
-def describe_environment(command: Sequence[str]) -> dict[str, Any]:
-    """What `info.json` says: versions, git commit, command line, start time; no path of this machine."""
-    versions: dict[str, str | None] = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions[package] = None
-    described = _git_describe()
-    return {
-        "versions": versions,
-        "commit": described and described.removesuffix("-dirty"),
-        "dirty": described and described.endswith("-dirty"),
-        # Absolute paths, alone or after `key=`, are cut to their last part.
-        "command": shlex.join(re.sub(r"(^|=)/.*/(?=.)", r"\1", word) for word in command),
-        "platform": platform.platform(),
-        "processor": processor(),
-        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-    }
-
-
-def processor() -> str:
-    """The name of the CPU: float rounding depends on its instructions."""
-    with suppress(OSError), open("/proc/cpuinfo") as file:
-        for line in file:
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
-
-
-def _git_describe() -> str | None:
-    """The commit of this code, plus `-dirty` if tracked files are changed; None outside a repository."""
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(Path(__file__).parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.strip()
-
-    try:
-        # Installed into an environment that lies in another repository, this file is not that repository's.
-        git("ls-files", "--error-unmatch", Path(__file__).name)
-        return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
-    except (OSError, subprocess.SubprocessError):
-        return None
 
 
 class RunWriter:
@@ -270,29 +220,6 @@ def _move_aside(folder: Path) -> None:
     while (target := folder.with_name(f"{folder.name}.old-{number}")).exists():
         number += 1
     folder.rename(target)
-
-
-def replace_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Write a file so that `path` holds the old content or all of the new, whenever the process or the machine dies.
-
-    OSError that names the file where it cannot be written.
-    """
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        with open(temporary, "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # makes the new name last
-        finally:
-            os.close(folder)
-    except OSError as error:
-        with suppress(OSError):
-            temporary.unlink()  # on a full disk it would be in the way
-        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 class Evaluations(NamedTuple):
@@ -424,10 +351,3 @@ def _read_rows(path: Path) -> tuple[list[str], np.ndarray]:
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: {one_line(error)}") from error
     return columns, np.array(rows, dtype=np.float64).reshape(-1, len(columns))
-
-
-def one_line(error: Exception) -> str:
-    """What `error` says to the user."""
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror.lower()
-    return " ".join(str(error).split())

@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,8 +26,10 @@ from typing import Any, NamedTuple
 
 import torch
 
-from core.replay import Replay
-from core.results import one_line, replace_file
+from store.files import one_line, replace_file
+
+Stretch = Callable[[int, int], Sequence[torch.Tensor]]
+"""Maps `start` and `stop` to views of one seed's transitions `start` to `stop` - 1, a row of float32 each."""
 
 _DAMAGES = (OSError, ValueError, KeyError, TypeError, RuntimeError, pickle.UnpicklingError)
 
@@ -61,13 +63,14 @@ class Checkpoint:
         """What `CheckpointFolder.write` was given."""
         return _load(self.path)["state"]
 
-    def fill(self, replay: Replay, i: int) -> None:
-        """Put the transitions back into position i of `replay`."""
+    def fill(self, stretch: Stretch, oldest: int) -> None:
+        """Put the transitions from `oldest` on, the first one that the ring has not overwritten, into `stretch`."""
         for name, start, stop, _ in self.replay_files:
-            kept = max(start, replay.added[i] - replay.capacity)  # the ring has overwritten those before
+            kept = max(start, oldest)
+            views = stretch(kept, stop)
             with open(self.path.parent / name, "rb") as file:
-                file.seek((kept - start) * sum(replay.widths) * 4)
-                for rows in replay.stretch(i, kept, stop):
+                file.seek((kept - start) * views[0].shape[-1] * 4)
+                for rows in views:
                     read = torch.empty_like(rows, device="cpu")
                     file.readinto(read.numpy().data.cast("B"))
                     rows.copy_(read)
@@ -92,12 +95,16 @@ class CheckpointFolder:
         step: int,
         settings: Mapping[str, Any],
         state: Mapping[str, Any],
-        replay: Replay,
-        i: int,
+        stretch: Stretch,
+        oldest: int,
+        stop: int,
     ) -> None:
-        """Write the state and the new transitions of the seed in position i of `replay`; OSError where that fails."""
+        """Write the state and the new transitions of a seed. Its buffer holds `oldest` to `stop` - 1.
+
+        OSError where that fails.
+        """
         self.folder.mkdir(exist_ok=True)
-        files = self._write_replay(replay, i)
+        files = self._write_replay(stretch, oldest, stop)
         content = {"serial": self.serial + 1, "moment": moment, "group": list(group), "step": step}
         content |= {"settings": dict(settings), "replay_files": [list(file) for file in files]}
         body = io.BytesIO()
@@ -121,18 +128,16 @@ class CheckpointFolder:
             if path.name not in used:
                 path.unlink()
 
-    def _write_replay(self, replay: Replay, i: int) -> list[ReplayFile]:
-        """Write the transitions added since the newest checkpoint; the files with all that are in the buffer now."""
-        stop = replay.added[i]
-        oldest = max(0, stop - replay.capacity)
+    def _write_replay(self, stretch: Stretch, oldest: int, stop: int) -> list[ReplayFile]:
+        """Write the transitions since the newest checkpoint; return the files that hold `oldest` to `stop` - 1."""
         files = [file for file in self.files if file.stop > oldest]
         start = max(oldest, files[-1].stop if files else 0)
         if start < stop:
             name, digest = f"replay-{start}-{stop}.f32", hashlib.sha256()
-            stretch = [rows.cpu().numpy().data.cast("B") for rows in replay.stretch(i, start, stop)]
-            for rows in stretch:
-                digest.update(rows)
-            replace_file(self.folder / name, lambda file: file.writelines(stretch))
+            blocks = [rows.cpu().numpy().data.cast("B") for rows in stretch(start, stop)]
+            for block in blocks:
+                digest.update(block)
+            replace_file(self.folder / name, lambda file: file.writelines(blocks))
             files.append(ReplayFile(name, start, stop, digest.hexdigest()))
         return files
 
@@ -186,7 +191,7 @@ def saved_step(run_folder: str | Path) -> int:
     return max((int(name.rpartition("-")[2]) for name in names), default=0)
 
 
-def choose(
+def group_checkpoints(
     intact: Mapping[int, Sequence[Checkpoint]], started: Mapping[int, tuple[int, ...]]
 ) -> tuple[list[dict[int, Checkpoint]], list[int]]:
     """Which seeds to take up together, each from which checkpoint, and which seeds to start from the beginning.

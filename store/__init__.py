@@ -1,0 +1,1 @@
+"""One run on disk: its folder and files, checkpoints, lock, provenance, and signals that end it."""

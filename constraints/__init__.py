@@ -5,10 +5,8 @@ from constraints.base import Constraint
 from constraints.box import Box
 from constraints.ellipse import DiagonalEllipse, PlanarEllipse
 from constraints.errors import ConstraintError
-from constraints.intersection import Intersection
+from constraints.general import Intersection, LinearConstraint, QuadraticConstraint
 from constraints.l1_and_ellipse import WeightedL1AndEllipse
-from constraints.linear import LinearConstraint
-from constraints.quadratic import QuadraticConstraint
 from constraints.weighted import HalfSpace, WeightedL1, WeightedPositivePart
 
 __all__ = [

@@ -1,16 +1,18 @@
-"""A ball inside the box (R+L2): everything in closed form, the cheapest set of all but the box."""
+"""A ball inside the box (R+L2). Everything is a closed form; only the box alone is cheaper."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from constraints.base import Constraint, ExplicitSet, JacobianProduct, largest_gauge
+from constraints.base import Constraint, Ellipse, ExplicitSet
 from constraints.ellipse import ellipse_gauge_gradient
+from constraints.gauge import largest_gauge
+from constraints.jacobian import JacobianProduct
 
 
 class Ball(Constraint):
-    """sum a_i^2 <= bound <= 1, so that the box is never active. ValueError for another bound."""
+    """sum a_i^2 <= bound <= 1, so the box is never active. ValueError for another bound."""
 
     def __init__(self, bound: float, dim: int):
         super().__init__(dim)
@@ -21,13 +23,11 @@ class Ball(Constraint):
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         identity = torch.eye(self.dim, dtype=obs.dtype, device=obs.device).expand(*obs.shape[:-1], -1, -1)
-        return obs.new_zeros(0, self.dim), obs.new_zeros(0), [(identity, obs.new_zeros(self.dim), self.bound)]
+        ellipse = Ellipse(identity, obs.new_zeros(self.dim), self.bound)
+        return ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [ellipse])
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        return action.norm(dim=-1) - self.radius  # the identity's trace is dim already
-
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        return self._violation(obs, action).clamp(min=0.0)
+        return action.norm(dim=-1) - self.radius  # the trace of the identity is dim already
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         norm = action.norm(dim=-1, keepdim=True)
@@ -43,5 +43,9 @@ class Ball(Constraint):
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         return torch.nn.functional.normalize(gradient, dim=-1, eps=1e-300) * self.radius
 
+    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        return [ellipse_gauge_gradient(direction, direction, center, center, self.bound)]
+
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
-        return largest_gauge(direction, ellipse_gauge_gradient(direction, direction, center, center, self.bound))
+        # The box is never active.
+        return largest_gauge(direction, *self._gauge_gradients(obs, direction, center))

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from constraints.base import (
-    Constraint,
-    ExplicitSet,
-    JacobianProduct,
-    box_gauge_gradient,
-    deflated_jacobian,
-    largest_gauge,
-)
+from constraints.base import Constraint, ExplicitSet
+from constraints.jacobian import JacobianProduct, deflated_jacobian
 
 
 class Box(Constraint):
     """The box [-1, 1]^dim."""
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
-        return obs.new_zeros(0, self.dim), obs.new_zeros(0), []
+        return ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [])
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         return action.abs().amax(-1) - 1.0
@@ -29,8 +23,8 @@ class Box(Constraint):
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         return action.clamp(-1.0, 1.0), deflated_jacobian((action.abs() < 1.0).double())
 
-    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
-        return largest_gauge(direction, box_gauge_gradient(direction, center))
+    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        return []
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         return gradient.sign()

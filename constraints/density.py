@@ -1,7 +1,7 @@
 """Log-densities of a policy after the radial and alpha maps (paper, "Action Constraints to SAC").
 
-Both carry their gradients in closed form: autograd through the formulas would meet 0/0 or cancel, and cost more.
-First derivatives only: `create_graph=True` is refused with a RuntimeError.
+Both have their gradients in closed form. Autograd through the formulas would meet 0/0, or lose digits, and cost more.
+They have first derivatives only; `create_graph=True` raises a RuntimeError.
 """
 
 from __future__ import annotations
@@ -13,15 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from constraints.numerics import refuse_second_derivatives
+
 _NODES = 28  # Gauss-Legendre nodes on the window of the ray integral
 _DROP = 25.0  # the window ends where the log of the integrand has fallen by at least this much
-
-
-def refuse_second_derivatives() -> None:
-    """Called in the backward of a function whose gradient is a closed form. RuntimeError under `create_graph=True`."""
-    # PyTorch's once_differentiable would let them pass as zeros: the saved tensors carry no graph.
-    if torch.is_grad_enabled():
-        raise RuntimeError("projections, maps and their log-densities have first derivatives only")
 
 
 class _RadialLogDet(torch.autograd.Function):
@@ -74,15 +69,15 @@ def log_ray_integral(
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """log I(A, B), I = integral from 1 to infinity of t^(d-1) exp(-(A t + B)^2) dt, and its two derivatives.
 
-    Gauss-Legendre quadrature on a window around the mode that holds all but e^-25 of the integrand, whatever
-    A and B. All its terms are positive; those of the paper's recursion through erf cancel when B is large.
+    Gauss-Legendre quadrature on a window around the mode, outside of which the integrand is below e^-25 of its peak,
+    for any A and B. All terms are positive. The terms of the paper's recursion through erf cancel when B is large.
 
     Args:
         slope, intercept: (...) A > 0 and B, float64.
         dim: d >= 1.
-        derivatives: whether they are wanted.
+        derivatives: whether to compute the two derivatives.
     Returns:
-        (...) each: log I, d log I / dA, d log I / dB, or None for both. Outside autograd.
+        log I, d log I / dA and d log I / dB, each (...); None for the derivatives without them. Outside autograd.
     """
     # In w = A t, the log of the integrand is h(w) = k log(w / A) - (w + B)^2 on w >= A: concave (k = d - 1).
     k = dim - 1
@@ -98,7 +93,7 @@ def log_ray_integral(
         right = torch.minimum(right, mode * reach)
     width = (left + right) / mode
 
-    # In place, as the temporaries of a large batch cost more to allocate than to fill.
+    # In place: allocating the temporaries of a large batch costs more than filling them.
     nodes, weights = _quadrature(slope.device)
     r = width[..., None] * nodes
     r -= (left / mode)[..., None]
@@ -114,7 +109,7 @@ def log_ray_integral(
     if not derivatives:
         return log_integral, None, None
     mean_inverse = lower @ weights * width / (mode * mass)  # E[1 / (A t)]
-    # Integration by parts makes both derivatives sums of one sign; differences of moments would cancel:
+    # Integration by parts gives both derivatives as sums of terms of one sign; differences of moments would cancel.
     # -d/dA = (e / I + d) / A and -d/dB = (e / I + (d - 1) E[1 / t]) / A, with e = exp(-(A + B)^2).
     edge = torch.exp((mode - slope) * (at_mode + slope + intercept) - rise) / (mass * mode)  # e / (A I)
     return log_integral, -(edge + dim / slope), -(edge + k * mean_inverse)

@@ -5,20 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from constraints.base import (
-    Coefficients,
-    Constraint,
-    ExplicitSet,
-    JacobianProduct,
-    box_gauge_gradient,
-    deflated_jacobian,
-    keep_nan,
-    largest_gauge,
-    safe_sqrt,
-)
-from constraints.separable import BoxProblem, RowProblem, minimize_under_ellipse
+from constraints.base import Coefficients, Constraint, Ellipse, ExplicitSet
+from constraints.jacobian import JacobianProduct, deflated_jacobian
+from constraints.numerics import keep_nan, safe_sqrt
+from constraints.scalar_dual import BoxProblem, RowProblem, minimize_under_ellipse
 
+# A point of the ellipse that is further outside the box than this is not in it.
 _ROUNDING = 1e-13
+# A square below this may be rounding next to 0, and its root a direction in which the ellipse does not end.
 _FLAT = 1e-280
 # Newton needs 3 to 10 steps.
 _MAX_STEPS = 40
@@ -34,15 +28,12 @@ class DiagonalEllipse(Constraint):
         self.bound = bound
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
-        ellipse = torch.diag_embed(self.scale(obs)), obs.new_zeros(self.dim), self.bound
-        return obs.new_zeros(0, self.dim), obs.new_zeros(0), [ellipse]
+        ellipse = Ellipse(torch.diag_embed(self.scale(obs)), obs.new_zeros(self.dim), self.bound)
+        return ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [ellipse])
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         scale = self.scale(obs)
         return ellipse_excess((scale * action**2).sum(-1), scale.sum(-1), self.bound, self.dim)
-
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        return self._violation(obs, action).clamp(min=0.0)
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         return minimize_in_ellipse(BoxProblem(action.abs()), action, 1.0, self.scale(obs), self.bound)
@@ -50,16 +41,10 @@ class DiagonalEllipse(Constraint):
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         return minimize_in_ellipse(BoxProblem(gradient.abs()), gradient, 0.0, self.scale(obs), self.bound)[0]
 
-    def gauge_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
-        """Gradient (..., d) of the gauge of the ellipse, the box left out."""
+    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         scale = self.scale(obs)
         bent = None if center is None else scale * center
-        return ellipse_gauge_gradient(direction, scale * direction, center, bent, self.bound)
-
-    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
-        return largest_gauge(
-            direction, box_gauge_gradient(direction, center), self.gauge_gradient(obs, direction, center)
-        )
+        return [ellipse_gauge_gradient(direction, scale * direction, center, bent, self.bound)]
 
 
 class PlanarEllipse(Constraint):
@@ -75,15 +60,13 @@ class PlanarEllipse(Constraint):
         self.bound = bound
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
-        return obs.new_zeros(0, 2), obs.new_zeros(0), [(self.matrix(obs), obs.new_zeros(2), self.bound)]
+        ellipse = Ellipse(self.matrix(obs), obs.new_zeros(2), self.bound)
+        return ExplicitSet(obs.new_zeros(0, 2), obs.new_zeros(0), [ellipse])
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         matrix = self.matrix(obs)
         value = _Planar(matrix, self.bound).value(action).squeeze(-1)
         return ellipse_excess(value, matrix.diagonal(dim1=-2, dim2=-1).sum(-1), self.bound, 2)
-
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        return self._violation(obs, action).clamp(min=0.0)
 
     def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         planar = _Planar(self.matrix(obs), self.bound)
@@ -92,8 +75,8 @@ class PlanarEllipse(Constraint):
         on_ellipse, mu = planar.project(action)
         in_box = on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + _ROUNDING
 
-        # The best point of a face, mirrored to a_i = 1, is that of its interval nearest to the other coordinate.
-        # Squared distances are compared without |action|^2, beside which those of a far point would be equal.
+        # On a face, mirrored to a_i = 1, the best point is the one of its interval nearest to the other coordinate.
+        # Squared distances leave out |action|^2: beside it, those of a far point would be equal.
         own, other = _mirrored(action), _mirrored(action.flip(-1))
         low, high, met = planar.faces()
         moved = torch.minimum(torch.maximum(other, low), high)
@@ -133,14 +116,10 @@ class PlanarEllipse(Constraint):
         solution = torch.where(best, on_ellipse, on_face)
         return within_ellipse(solution, planar.times(solution), self.bound)
 
-    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         planar = _Planar(self.matrix(obs), self.bound)
         bent = None if center is None else planar.times(center)
-        return largest_gauge(
-            direction,
-            box_gauge_gradient(direction, center),
-            ellipse_gauge_gradient(direction, planar.times(direction), center, bent, self.bound),
-        )
+        return [ellipse_gauge_gradient(direction, planar.times(direction), center, bent, self.bound)]
 
 
 class _Planar:
@@ -190,14 +169,14 @@ class _Planar:
             rise = torch.addcmul((trace + 2.0 * turn) * value, scale, slope, value=-1.0).clamp_(min=1e-300)
             step = (value.sqrt().div_(root_bound) - scale).mul_(value).div_(rise).clamp_(min=0.0)
             mu = mu + step
-            # As in minimize_under_ellipse. A NaN counts as settled.
+            # A GPU does all steps, as in minimize_under_ellipse. A NaN counts as settled.
             if action.is_cpu and not (step > 1e-12 * mu).any():
                 break
         return torch.addcmul(action, mu, adjugate) / (1.0 + mu * (trace + mu * determinant)), mu
 
     def faces(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the faces a_1 = 1 and a_2 = 1, the interval (low, high) of the other coordinate that is feasible, and
-        whether there is one, each (..., 2, 1). Those of a_i = -1 are the same, mirrored."""
+        """The feasible interval (low, high) of the other coordinate on the faces a_1 = 1 and a_2 = 1, and whether there
+        is one, each (..., 2, 1). The faces a_i = -1 have the same, mirrored."""
         held, moved = self.diagonal, self.diagonal.flip(-1).clamp(min=1e-200)
         discriminant = self.cross.square() - moved * (held - self.bound)
         root = discriminant.clamp(min=0.0).sqrt()
@@ -207,7 +186,7 @@ class _Planar:
 
 
 def _mirrored(vector: Tensor) -> Tensor:
-    """(..., 2, 2): each coordinate, and with its sign turned."""
+    """Each coordinate and its negative (..., 2, 2)."""
     return torch.stack((vector, -vector), -1)
 
 
@@ -222,8 +201,11 @@ def _on_face(face: Tensor, moved: Tensor) -> Tensor:
 def minimize_in_ellipse(
     problem: RowProblem | BoxProblem, target: Tensor, shift: float, scale: Tensor, bound: float
 ) -> tuple[Tensor, JacobianProduct]:
-    """Minimiser (..., d) of sum(shift a^2 / 2 - target a) over a problem's set, which mirrors the target, and
-    sum(scale a^2) <= bound; and the product with its Jacobian in the target."""
+    """Minimiser (..., d) of sum(shift a^2 / 2 - target a) over a problem's set and sum(scale a^2) <= bound.
+
+    The problem holds the target mirrored to be positive. Also returns the product with the minimiser's Jacobian in
+    the target.
+    """
     point, solution, mu = minimize_under_ellipse(problem, shift, scale, bound)
     point = torch.copysign(within_ellipse(point, scale * point, bound), target)
 
@@ -235,7 +217,7 @@ def minimize_in_ellipse(
 
 
 def within_ellipse(point: Tensor, bent: Tensor, bound: float) -> Tensor:
-    """The point (..., d), `bent` = Q point, with a rounding excess over point'Q point <= bound taken off."""
+    """The point (..., d), shrunk where rounding takes it out of point'Q point <= bound; `bent` is Q point."""
     value = (point * bent).sum(-1, keepdim=True)
     return point * (bound / value.clamp(min=bound)).sqrt()
 
@@ -257,7 +239,7 @@ def ellipse_gauge_gradient(
 
     1 / L is the positive root of the quadratic in t at center + t direction.
     """
-    # Written so that a NaN is passed on. What is flat does not bound the ray; it may be next to 0 by rounding.
+    # Comparisons are such that a NaN stays. A flat direction does not bound the ray.
     curvature = (direction * bent_direction).sum(-1, keepdim=True)
     if center is None or bent_center is None:
         flat = curvature < _FLAT

@@ -1,4 +1,4 @@
-"""The error of a feasible set that is ill-posed, empty or without interior."""
+"""The error for a feasible set that is ill-posed, empty or without interior."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SampleName = Callable[[int], str]
 
 
 class ConstraintError(ValueError):
-    """A constraint's coefficients, its observation or the set itself do not allow what was asked."""
+    """An operation that the constraint's coefficients, its observation or the set itself do not allow."""
 
 
 def name_samples(lead: tuple[int, ...]) -> SampleName:
@@ -30,7 +30,7 @@ def name_samples(lead: tuple[int, ...]) -> SampleName:
 
 
 def require(valid: Tensor, message: str, name: SampleName) -> None:
-    """Raises a ConstraintError that names the first sample where `valid` (n,), or (n, m) over rows, is False."""
+    """Raise a ConstraintError that names the first sample where `valid` (n,), or (n, m) over rows, is False."""
     if bool(valid.all()):
         return
     first = (~valid).nonzero()[0].tolist()

@@ -1,29 +1,68 @@
 """The maps into a feasible set along rays from its centre, and the densities that a policy has after them.
 
-One evaluation of the gauge serves the map, the density and the gradients of both.
+One evaluation of the gauge serves a map, its density and the gradients of both. Gradients are closed forms.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from constraints.density import alpha_boundary_log_density, radial_log_det, refuse_second_derivatives
+from constraints.density import alpha_boundary_log_density, radial_log_det
+from constraints.gauge import box_gauge_gradient
+from constraints.numerics import one_where_zero, refuse_second_derivatives, with_gradient
 
 _TINY = 1e-150
+# The gauge map's stretch differs from direction to direction, so the gradient of its logarithm grows like 1 / |u|
+# towards u = 0. From this max_i |u_i| inwards it grows no more: a policy comes there once in a million samples (d = 2),
+# and the variance of its gradient would be infinite.
+_NEAR_CENTER = 1e-3
 
 
 class Ray:
-    """The ray from a centre c through actions (..., d), with the set's gauge L of the offset `action - c`.
+    """The ray from a centre c on which a map moves actions (..., d).
 
-    `gauge` (...) and `gradient` (..., d) are those of the offset; `center` is None for the origin.
+    The alpha and radial maps move an action on its own ray, along its offset v = action - c. The gauge map takes the
+    action for the offset. All results are in the action's dtype.
+
+    Args:
+        action: (..., d) float32 or float64, before the map.
+        center: (..., d) or (d,) float64, None for the origin.
+        offset: (..., d) float64, action - c with all leading dimensions.
+        gauge_of: returns the set's gauge L (...) around c and its gradient (..., d), for offsets (..., d).
     """
 
-    def __init__(self, action: Tensor, center: Tensor | None, offset: Tensor, gauge: Tensor, gradient: Tensor):
+    def __init__(
+        self,
+        action: Tensor,
+        center: Tensor | None,
+        offset: Tensor,
+        gauge_of: Callable[[Tensor], tuple[Tensor, Tensor]],
+    ):
         self.action, self.center, self.offset = action, center, offset
-        self.gauge, self.gradient = gauge.detach(), gradient
+        self._gauge_of = gauge_of
+
+    @property
+    def gauge(self) -> Tensor:
+        """Gauge L (...) of the offset."""
+        return self._gauge_and_gradient[0]
+
+    @property
+    def gradient(self) -> Tensor:
+        """Gradient (..., d) of the gauge at the offset, differentiable in it."""
+        return self._gauge_and_gradient[1]
+
+    @cached_property
+    def _gauge_and_gradient(self) -> tuple[Tensor, Tensor]:
+        # With autograd where the ray was made with it, whoever asks first.
+        with torch.set_grad_enabled(self.offset.requires_grad):
+            gauge, gradient = self._gauge_of(self.offset)
+        return gauge.detach(), gradient
 
     def alpha_map(self) -> Tensor:
         """alpha-projection (..., d): the feasible point closest to the action on its ray."""
@@ -38,6 +77,15 @@ class Ray:
         # Near 0 the slope is only right to 1e-16 / L; it multiplies an offset of size L.
         return self._scaled(factor, (1.0 - tanh.square() - factor) / gauge)
 
+    def gauge_map(self) -> Tensor:
+        """Gauge map (..., d), c + phi u with phi = max_i |u_i| / L(u), of u = `action` in the box.
+
+        At u = 0 it has no derivative. Value and gradient there are those of phi = 1.
+        """
+        stretch = self._stretch
+        mapped = _Scale.apply(self._action64(), stretch.factor, stretch.direction, stretch.factor, stretch.slope)
+        return self._from_center(mapped)
+
     def radial_log_prob(self, log_prob: Tensor, unit_ball: bool = False, floor: float = 0.0) -> Tensor:
         """Log-density (...) of `radial_map()`, given the log-density `log_prob` (...) of the action.
 
@@ -45,7 +93,7 @@ class Ray:
             unit_ball: measure in unit-ball coordinates, see `log_reach`.
             floor: added to the map's Jacobian determinant, whose exact value may be tiny, before the logarithm.
         """
-        gauge = differentiable_gauge(self.offset, self.gauge, self.gradient)
+        gauge = with_gradient(self.offset, self.gauge, self.gradient)
         log_det = radial_log_det(gauge, self.offset.shape[-1])
         if floor > 0.0:
             log_det = torch.logaddexp(log_det, torch.full_like(log_det, math.log(floor)))
@@ -53,6 +101,27 @@ class Ray:
         if unit_ball:
             density = density + self.offset.shape[-1] * self.log_reach()
         return density.to(log_prob.dtype)
+
+    def gauge_log_prob(self, log_prob: Tensor, unit_ball: bool = False) -> Tensor:
+        """Log-density (...) of `gauge_map()`, given the log-density `log_prob` (...) of the action.
+
+        phi is homogeneous of degree 0, so the determinant of the map's Jacobian is phi^d. The gradient of log phi is
+        exact where max_i |u_i| >= 1e-3, keeps the size that it has there nearer to 0, and counts as 0 at 0.
+
+        Args:
+            unit_ball: measure in unit-ball coordinates, see `log_reach`. The gauge cancels in them.
+        """
+        stretch = self._stretch
+        if unit_ball:
+            # log phi - log r = log max_i |u_i| - log |u|, with r = |u| / L(u) the distance to the boundary.
+            square = one_where_zero(stretch.direction.square().sum(-1))
+            value = -square.log() / 2.0
+            gradient = stretch.face - stretch.direction / square.unsqueeze(-1)
+        else:
+            value, gradient = stretch.factor.log(), stretch.slope
+        size = stretch.size.clamp(min=_NEAR_CENTER).unsqueeze(-1)
+        log_scale = with_gradient(self._action64(), value, gradient / size)
+        return (log_prob.double() - self.offset.shape[-1] * log_scale).to(log_prob.dtype)
 
     def alpha_log_prob(
         self, mean: Tensor, std: Tensor, unit_ball: bool = False, boundary_weight: float = 1.0
@@ -69,9 +138,9 @@ class Ray:
         residual = (self.action.double() - mean) / std
         interior = -(0.5 * residual**2 + std.log()).sum(-1) - 0.5 * offset.shape[-1] * math.log(2.0 * math.pi)
         inside = self.gauge <= 1.0
-        # Harmless stand-ins inside keep the unused branch, and so its gradient, finite.
+        # Inside, harmless stand-ins keep the unused branch finite, and its gradient too.
         spread = inside.unsqueeze(-1)
-        gauge = differentiable_gauge(offset, self.gauge, self.gradient)
+        gauge = with_gradient(offset, self.gauge, self.gradient)
         to_boundary = torch.where(spread, 1.0, offset / torch.where(inside, 1.0, gauge).unsqueeze(-1))
         origin = torch.zeros_like(offset) if self.center is None else self.center.expand_as(offset)
         # The boundary's element of surface is reach^d |grad L| times the unit sphere's. A gradient of length 1 here
@@ -91,43 +160,59 @@ class Ray:
         In unit-ball coordinates y = L(v) v / |v| every set is the unit ball, whatever the state and the units:
         entropies measured there mean the same everywhere. dy = dv / r^d, so the interior's log-density gains d log r.
         """
-        gauge = differentiable_gauge(self.offset, self.gauge, self.gradient)
+        gauge = with_gradient(self.offset, self.gauge, self.gradient)
         square = self.offset.square().sum(-1)
         away = square > 0.0
         return torch.where(away, square, 1.0).log() / 2.0 - torch.where(away, gauge, 1.0).log()
 
     def _scaled(self, factor: Tensor, slope: Tensor) -> Tensor:
         """c + factor (action - c), where the factor is a function of L with derivative `slope`."""
-        mapped = _Scale.apply(self.offset, factor, slope, self.gradient.detach())
+        return self._from_center(_Scale.apply(self.offset, factor, self.offset, slope, self.gradient.detach()))
+
+    def _from_center(self, mapped: Tensor) -> Tensor:
         return (mapped if self.center is None else self.center + mapped).to(self.action.dtype)
+
+    def _action64(self) -> Tensor:
+        """The action (..., d) in float64 with all leading dimensions: the offset that the gauge map scales."""
+        return self.action.double().expand_as(self.offset)
+
+    @cached_property
+    def _stretch(self) -> _Stretch:
+        with torch.no_grad():
+            offset = self._action64()
+            size = offset.abs().amax(-1)
+            direction = offset / one_where_zero(size).unsqueeze(-1)
+            gauge, gradient = self._gauge_of(direction)
+            # A NaN gauge stays NaN.
+            factor = torch.where(size == 0.0, 1.0, gauge).reciprocal()
+            face = box_gauge_gradient(direction, None)
+            return _Stretch(size, direction, face, factor, face - factor.unsqueeze(-1) * gradient)
+
+
+class _Stretch(NamedTuple):
+    """What the gauge map and its density need of the actions u.
+
+    phi is evaluated at u / max_i |u_i|, where it is 1 / L: it is the same there, and no square underflows.
+    """
+
+    size: Tensor  # (...) max_i |u_i|
+    direction: Tensor  # (..., d) u / size, 0 at u = 0
+    face: Tensor  # (..., d) gradient of the size
+    factor: Tensor  # (...) phi, 1 at u = 0
+    slope: Tensor  # (..., d) size times the gradient of log phi, 0 at u = 0
 
 
 class _Scale(torch.autograd.Function):
+    """offset * factor, with the Jacobian factor I + slope direction gradient'."""
+
     @staticmethod
-    def forward(ctx, offset: Tensor, factor: Tensor, slope: Tensor, gradient: Tensor) -> Tensor:
-        ctx.save_for_backward(offset, factor, slope, gradient)
+    def forward(ctx, offset: Tensor, factor: Tensor, direction: Tensor, slope: Tensor, gradient: Tensor) -> Tensor:
+        ctx.save_for_backward(factor, direction, slope, gradient)
         return offset * factor.unsqueeze(-1)
 
     @staticmethod
     def backward(ctx, grad: Tensor):
         refuse_second_derivatives()
-        offset, factor, slope, gradient = ctx.saved_tensors
-        along = (offset * grad).sum(-1) * slope
-        return torch.addcmul(grad * factor.unsqueeze(-1), along.unsqueeze(-1), gradient), None, None, None
-
-
-class _Gauge(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, direction: Tensor, gauge: Tensor, gradient: Tensor) -> Tensor:
-        ctx.save_for_backward(gradient)
-        return gauge.clone()
-
-    @staticmethod
-    def backward(ctx, grad: Tensor):
-        refuse_second_derivatives()
-        return grad.unsqueeze(-1) * ctx.saved_tensors[0], None, None
-
-
-def differentiable_gauge(direction: Tensor, gauge: Tensor, gradient: Tensor) -> Tensor:
-    """The `gauge` (...) of `direction` (..., d) with `gradient` (..., d) as its derivative."""
-    return _Gauge.apply(direction, gauge.detach(), gradient.detach())
+        factor, direction, slope, gradient = ctx.saved_tensors
+        along = (direction * grad).sum(-1) * slope
+        return torch.addcmul(grad * factor.unsqueeze(-1), along.unsqueeze(-1), gradient), None, None, None, None

@@ -22,10 +22,10 @@ from tqdm import tqdm
 
 from core.agent import Agent
 from core.config import Config
+from core.cuda_graph import GradientSteps
 from core.evaluation import Evaluator
-from core.graph import GradientSteps
 from core.random import stream_seed
-from core.replay import Replay
+from core.replay import Batch, Replay
 from envs import InfeasibleActionError, step_together
 from store.checkpoint import Checkpoint, CheckpointFolder
 from store.files import one_line
@@ -81,7 +81,7 @@ class Trainer:
         self.checkpoints = [CheckpointFolder(writer.folder) for writer in writers]
         self.began = False
         self.steps_at_checkpoint = 0  # of all seeds together
-        self.seconds = dict.fromkeys(("environment", "map", "update", "evaluation", "checkpoint"), 0.0)
+        self.seconds = dict.fromkeys(("environment", "acting", "update", "evaluation", "checkpoint"), 0.0)
         self.started = time.perf_counter()
         self.show_progress = progress
 
@@ -126,8 +126,7 @@ class Trainer:
         self.began = True
         for i, (env, seed) in enumerate(zip(self.envs, self.seeds, strict=True)):
             self.obs[i] = self._tensor(env.reset(seed=stream_seed(seed, "environment"))[0])
-        if self.agent.stores_centers:
-            self.center = self.agent.constraint.center(self.obs)
+        self.center = self.agent.centers(self.obs)
         self.agent.start_rollout(range(len(self.seeds)))
 
     def _advance(self, live: Sequence[int]) -> None:
@@ -168,15 +167,19 @@ class Trainer:
 
     def _step(self, which: Sequence[int]) -> None:
         """One environment step of the seeds `which`."""
-        suggested, executed = self._act(which)
-        actions = executed.numpy()
+        with self._timed("acting"):
+            starts = self.config.learning_starts
+            warming_up = [i for i in which if self.steps[i] < starts]
+            exploring = [i for i in which if self.steps[i] >= starts]
+            action = self.agent.act(self.obs, self.center, warming_up, exploring)
+        actions = action.executed.numpy()
         arrived, reset_obs = self.obs.numpy().copy(), {}
         reward, terminated, ended = (np.zeros((len(self.seeds), 1), dtype=np.float32) for _ in range(3))
         with self._timed("environment"):
-            finite = np.isfinite(suggested.numpy()).all(-1)
+            finite = np.isfinite(action.stored.numpy()).all(-1)
             for i in which:
                 if not finite[i]:
-                    self._fail(i, f"suggested action {suggested[i].tolist()} is not finite")
+                    self._fail(i, f"action {action.stored[i].tolist()} is not finite")
             which = [i for i in which if finite[i]]
             outcomes = step_together([self.envs[i] for i in which], actions[which])
             for i, outcome in zip(which, outcomes, strict=True):
@@ -195,45 +198,17 @@ class Trainer:
         if not which:
             return
 
-        stored = suggested if self.agent.placement == "environment" else executed
         next_obs = self._tensor(arrived)
-        columns = [self.obs, stored, self._tensor(reward), self._tensor(terminated), next_obs]
-        if self.agent.stores_centers:
-            with self._timed("map"):
-                next_center = self.agent.constraint.center(next_obs)
-            columns += [self.center, next_center]
-        self.replay.add(which, *columns)
+        with self._timed("acting"):
+            next_center = self.agent.centers(next_obs)
+        rewards, ends = self._tensor(reward), self._tensor(terminated)
+        self.replay.add(which, Batch(self.obs, action.stored, rewards, ends, next_obs, self.center, next_center))
 
         self.obs = next_obs
         for i, obs in reset_obs.items():
             self.obs[i] = self._tensor(obs)
-        if self.agent.stores_centers:
-            self.center = self.agent.constraint.center(self.obs) if reset_obs else next_center
+        self.center = self.agent.centers(self.obs) if reset_obs else next_center
         self._count_step(which, ended[:, 0])
-
-    @torch.no_grad()
-    def _act(self, which: Sequence[int]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Suggested and executed actions (seeds, d); only the rows `which` mean anything."""
-        warm = [i for i in which if self.steps[i] < self.config.learning_starts]
-        trained = [i for i in which if self.steps[i] >= self.config.learning_starts]
-        suggested = torch.zeros(len(self.seeds), self.agent.action_dim)
-        if warm:
-            suggested[warm] = self.agent.warm_up(warm)[warm].cpu()
-        if trained:
-            suggested[trained] = self.agent.explore(self.obs.to(self.agent.device), trained)[trained].cpu()
-        with self._timed("map"):
-            if trained:
-                executed = self.agent.feasible(self.obs, suggested, self.center)
-            if warm:
-                pulled_back = self.agent.pull_back(self.obs, suggested, self.center)
-                executed = torch.where(self._rows(warm), pulled_back, executed) if trained else pulled_back
-        return suggested, executed
-
-    def _rows(self, which: Sequence[int]) -> torch.Tensor:
-        """Mask (seeds, 1) of the seeds `which`."""
-        mask = torch.zeros(len(self.seeds), 1, dtype=torch.bool)
-        mask[which] = True
-        return mask
 
     def _count_step(self, which: Sequence[int], ended: np.ndarray) -> None:
         """Advance the counters of `which`: rollouts that end, evaluations and ends of training that are due."""
@@ -243,7 +218,7 @@ class Trainer:
         for i in which:
             self.steps[i] += 1
             self.rollout_steps[i] += 1
-            over = ended[i] if config.train_freq == "episode" else self.rollout_steps[i] == int(config.train_freq)
+            over = ended[i] if config.train_freq == "episode" else self.rollout_steps[i] == config.train_freq
             if over:
                 if self.steps[i] > config.learning_starts:
                     every_step = config.gradient_steps == -1

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 
 import envs
-from algos import ALGORITHMS
-from core.config import KEYS, RUN_KEYS, Config, saved_settings
+from algos import ALGORITHMS, setting_keys
+from core.config import RUN_KEYS, Config, saved_settings
 from core.trainer import Trainer
 from core.words import ConfigError, parse_words
 from envs import TASKS, TOLERANCE
@@ -33,7 +33,7 @@ def train_words(words: str) -> bool:
     Returns whether every seed has a result; a seed that diverged has none. Raises ConfigError for wrong words,
     ConstraintError for a constraint that breaks down and LockedError if another process trains a run.
     """
-    return train_cells(make_cells(parse_words(words.split(), KEYS))) is Exit.DONE
+    return train_cells(make_cells(parse_words(words.split(), setting_keys()))) is Exit.DONE
 
 
 def train_cells(cells: Sequence[Cell], stop_if_asked: Callable[[], None] = lambda: None) -> Exit:
@@ -105,7 +105,7 @@ def make_trainer(
     train_envs = [make_env() for _ in seeds]
     obs_dim = train_envs[0].observation_space.shape[0]
     try:
-        agent = ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, list(seeds))
+        agent = ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, seeds)
         return Trainer(config, agent, train_envs, make_env, writers, progress, stop_if_asked)
     except RuntimeError as error:
         if not any(words in str(error) for words in ("allocate memory", "out of memory")):

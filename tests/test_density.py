@@ -7,45 +7,13 @@ import mpmath
 import numpy as np
 import pytest
 import torch
+from feasible_sets import SETS, feasible_sets, gauge_and_gradient, observation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from constraints import Box, Constraint, DiagonalEllipse, WeightedL1, WeightedPositivePart
 from constraints.density import alpha_boundary_log_density, log_ray_integral, radial_log_det
-
-WEIGHT = (2.0, -1.0, 0.7, 0.3, -1.5, 0.9)
-
-
-def weight(obs: Tensor) -> Tensor:
-    return obs
-
-
-def observation(dim: int) -> Tensor:
-    return torch.tensor(WEIGHT[:dim], dtype=torch.float64)
-
-
-def feasible_sets(dim: int) -> dict[str, tuple[Constraint, Tensor]]:
-    """Name -> (set, centre): polytopes and ellipses, cut and not cut by the box, centred and not."""
-    axis = torch.arange(dim, dtype=torch.float64)
-    shift = 0.15 * torch.cos(2.0 * axis + 1.0)
-    positive = WeightedPositivePart(weight, 1.0, dim)
-    return {
-        "box": (Box(dim), torch.zeros(dim, dtype=torch.float64)),
-        "box off centre": (Box(dim), 2.0 * shift),
-        "weighted l1": (WeightedL1(weight, 1.5, dim), torch.zeros(dim, dtype=torch.float64)),
-        "weighted l1 off centre": (WeightedL1(weight, 1.5, dim), shift),
-        "positive part": (positive, positive.center(observation(dim))),
-        "ball": (DiagonalEllipse(torch.ones_like, 0.6, dim), torch.zeros(dim, dtype=torch.float64)),
-        "ellipse cut by the box": (
-            DiagonalEllipse(lambda obs: obs.square(), 0.9, dim),
-            torch.zeros(dim, dtype=torch.float64),
-        ),
-    }
-
-
-SETS = tuple(feasible_sets(2))
 
 
 def gaussian(dim: int) -> tuple[Tensor, Tensor]:
@@ -269,13 +237,6 @@ def cone_rule(dim: int, count: int, nodes: int) -> tuple[Tensor, Tensor]:
 def radial_rule(nodes: int) -> tuple[Tensor, Tensor]:
     x, w = np.polynomial.legendre.leggauss(nodes)
     return torch.from_numpy(x + 1.0) / 2, torch.from_numpy(w) / 2
-
-
-def gauge_and_gradient(constraint, obs, direction, center) -> tuple[Tensor, Tensor]:
-    direction = direction.detach().requires_grad_()
-    gauge = constraint.gauge(obs, direction, center)
-    (gradient,) = torch.autograd.grad(gauge.sum(), direction)
-    return gauge.detach(), gradient
 
 
 def surface_rule(constraint, obs, center, direction, du) -> tuple[Tensor, Tensor]:

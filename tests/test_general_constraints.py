@@ -9,6 +9,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 import torch
+from feasible_sets import SHAPES, no_obs, random_set
 from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import nnls
@@ -57,39 +58,6 @@ class Disc(QuadraticConstraint):
 
     def c(self, obs: Tensor) -> Tensor:
         return obs[..., 2:4]
-
-
-def random_set(dim: int, rows: int, ellipses: int, rank: int, scale: float, seed: int, batch: int = 4) -> Constraint:
-    """A set around a random point of the box, rows of norm 1e-2 to 1e4, ellipses of `rank` and size `scale`; a row in
-    eight goes right past the point."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(batch, *shape, generator=generator, dtype=torch.float64)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(batch, *shape, generator=generator, dtype=torch.float64)
-
-    inside = 1.8 * uniform(dim) - 0.9
-    parts: list[Constraint] = []
-    if rows:
-        A = normal(rows, dim) * 10.0 ** (6.0 * uniform(rows, 1) - 2.0)
-        b = (A @ inside[..., None])[..., 0] + A.norm(dim=-1) * (0.01 + uniform(rows) ** 3)
-        parts.append(LinearConstraint(dim, lambda obs: A, lambda obs: b))
-    for _ in range(ellipses):
-        root = normal(rank, dim)
-        Q = root.mT @ root
-        bound = scale * (0.05 + uniform())
-        offset = normal(dim)
-        size = (offset * (Q @ offset[..., None])[..., 0]).sum(-1)
-        c = inside + offset * (bound / size).sqrt()[..., None] * 0.95 * uniform(1)
-        values = dict(Q=lambda obs, Q=Q: Q, bound=lambda obs, b=bound: b, c=lambda obs, c=c: c)
-        parts.append(QuadraticConstraint(dim, **values))
-    return parts[0] if len(parts) == 1 else Intersection(*parts)
-
-
-def no_obs(batch: int = 4) -> Tensor:
-    return torch.zeros(batch, 1, dtype=torch.float64)
 
 
 class Written:
@@ -143,21 +111,6 @@ class Written:
         if not normals:
             return distance
         return nnls(np.array(normals).T, outward / distance)[1] * min(distance, 1.0)
-
-
-SHAPES = [  # dim, rows, ellipses, rank, scale
-    (1, 2, 0, 1, 1.0),
-    (2, 3, 0, 1, 1.0),
-    (6, 40, 0, 1, 1.0),
-    (20, 30, 0, 1, 1.0),
-    (1, 0, 1, 1, 0.1),
-    (2, 0, 1, 2, 1.0),
-    (6, 0, 1, 3, 1.0),
-    (2, 2, 1, 2, 0.01),
-    (3, 4, 2, 3, 1.0),
-    (6, 10, 2, 2, 1.0),
-    (20, 10, 2, 20, 10.0),
-]
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
@@ -441,7 +394,9 @@ def test_extreme_coefficients(constraint, plain):
     action = torch.tensor([[2.0, 0.7], [-1.0, 0.3], [1e6, -3e5], [0.0, -1.1]], dtype=torch.float64)
     obs, center = no_obs(), plain.center(no_obs())
     # An ellipse as large as 1e6 is half a millionth off a half-space in the box.
-    close = dict(rtol=0.0, atol=1e-6 if isinstance(plain, LinearConstraint) and constraint.explicit(obs)[2] else 1e-10)
+    close = dict(
+        rtol=0.0, atol=1e-6 if isinstance(plain, LinearConstraint) and constraint.explicit(obs).ellipses else 1e-10
+    )
     torch.testing.assert_close(constraint.project(obs, action), plain.project(obs, action), **close)
     slope = action / action.norm(dim=-1, keepdim=True)
     best = [(each.linear_oracle(obs, slope) * slope).sum(-1) for each in (constraint, plain)]

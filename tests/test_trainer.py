@@ -14,7 +14,8 @@ import core.trainer
 from algos import ALGORITHMS
 from constraints import WeightedPositivePart
 from core.agent import Agent
-from core.config import Config, defaults
+from core.config import Config
+from core.maps import Alpha
 from core.random import Streams
 from core.trainer import Trainer
 from store.folder import RunWriter, is_finished, read_run
@@ -80,10 +81,12 @@ class Counter(Agent):
     """Its one parameter a seed counts gradient steps; its policy's reward is the score of that number."""
 
     def __init__(self, config, seeds, scores=()):
-        super().__init__(config, CONSTRAINT, OBS, seeds, mapping="alpha", placement="layer")
-        self.net = nn.Module()
-        self.net.count = nn.Parameter(torch.zeros(len(seeds), 1))
+        super().__init__(config, CONSTRAINT, OBS, seeds, map=Alpha(), placement="layer")
         self.scores, self.rollouts, self.trainer = scores, [], None
+
+    def build(self, init):
+        self.net = nn.Module()
+        self.net.count = nn.Parameter(torch.zeros(len(self.seeds), 1))
 
     def networks(self):
         return {"net": self.net}
@@ -91,7 +94,7 @@ class Counter(Agent):
     def optimizers(self):
         return {}
 
-    def explore(self, obs, only):
+    def explore(self, obs, which):
         return torch.full((len(self.seeds), DIM), 0.01)
 
     def policy(self, which: Sequence[int]):
@@ -108,8 +111,8 @@ class Counter(Agent):
         with torch.no_grad():
             self.net.count += 1
 
-    def start_rollout(self, only):
-        self.rollouts += [(i, self.trainer.steps[i]) for i in only]
+    def start_rollout(self, which):
+        self.rollouts += [(i, self.trainer.steps[i]) for i in which]
 
 
 def make_trainer(tmp_path, seeds=(4,), scores=(), agent=None, fail=None, fail_in_evaluation=None, **settings):
@@ -233,16 +236,16 @@ def test_a_later_evaluation_that_is_nan_is_not_best(tmp_path):
 @pytest.mark.parametrize(
     "train_freq, gradient_steps, learning_starts, wanted",
     [
-        ("8", 8, 10, 5 * 8),  # after the steps 16, 24, 32, 40, 48
-        ("8", 8, 16, 4 * 8),  # a rollout that ends with the warm-up is still warm-up
-        ("8", 3, 10, 5 * 3),
-        ("8", -1, 10, 5 * 8),
-        ("1", 1, 10, 39),  # after the steps 11 to 49: the run ends with step 50
-        ("1", 2, 0, 49 * 2),
+        (8, 8, 10, 5 * 8),  # after the steps 16, 24, 32, 40, 48
+        (8, 8, 16, 4 * 8),  # a rollout that ends with the warm-up is still warm-up
+        (8, 3, 10, 5 * 3),
+        (8, -1, 10, 5 * 8),
+        (1, 1, 10, 39),  # after the steps 11 to 49: the run ends with step 50
+        (1, 2, 0, 49 * 2),
         ("episode", -1, 10, 7 + 5 + 7 + 5 + 7 + 5 + 7),  # episodes end at 5, 12, 17, 24, 29, 36, 41 and 48
         ("episode", -1, 12, 5 + 7 + 5 + 7 + 5 + 7),
         ("episode", 2, 10, 7 * 2),
-        ("1", 1, 50, 0),
+        (1, 1, 50, 0),
     ],
 )
 def test_the_number_of_gradient_steps(tmp_path, train_freq, gradient_steps, learning_starts, wanted):
@@ -254,7 +257,7 @@ def test_the_number_of_gradient_steps(tmp_path, train_freq, gradient_steps, lear
 
 
 @pytest.mark.parametrize(
-    "train_freq, starts", [("8", [0, 8, 16, 24, 32, 40, 48]), ("episode", [0, 5, 12, 17, 24, 29, 36, 41, 48])]
+    "train_freq, starts", [(8, [0, 8, 16, 24, 32, 40, 48]), ("episode", [0, 5, 12, 17, 24, 29, 36, 41, 48])]
 )
 def test_the_agent_hears_of_every_rollout(tmp_path, train_freq, starts):
     trainer = make_trainer(tmp_path, seeds=(4, 6), train_freq=train_freq, gradient_steps=2)
@@ -279,7 +282,7 @@ def test_warm_up_actions_then_exploration(tmp_path):
 # ---------------------------------------------------------------- what is stored
 
 
-@pytest.mark.parametrize("train_freq", ["1", "episode"])
+@pytest.mark.parametrize("train_freq", [1, "episode"])
 def test_stored_transitions(tmp_path, train_freq):
     trainer = make_trainer(tmp_path, seeds=(4, 6), train_freq=train_freq)
     trainer.run()
@@ -304,14 +307,12 @@ def test_stored_transitions(tmp_path, train_freq):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_the_buffer_has_suggestions_where_the_environment_maps_and_executed_actions_elsewhere(tmp_path, name):
     algorithm = ALGORITHMS[name]
-    config = defaults(
-        name, "Scripted", "Hopper", algorithm.base, algorithm.mapping, name == "NFW", algorithm.penalty, steps=40
-    )
+    config = algorithm.paper_config(name, "Scripted", "Hopper", steps=40)
     config.hidden, config.learning_starts, config.batch_size, config.eval_every = [8, 8], 20, 4, 40
     config.eval_episodes = config.final_episodes = 1
-    if config.action_noise:
+    if name.startswith("D") or name == "NFW":
         config.action_noise = 1.0
-    agent = algorithm.agent(config, CONSTRAINT, OBS, [4], mapping=algorithm.mapping, placement=algorithm.placement)
+    agent = algorithm.build(config, CONSTRAINT, OBS, [4])
     trainer = make_trainer(tmp_path, agent=agent)
     trainer.run()
     obs, stored, *_ = transitions(trainer)

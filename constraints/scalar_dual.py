@@ -11,15 +11,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_TINY = 1e-300
-_HUGE = 1e100
+_TINY = 1e-300  # a divisor in the place of 0
+_HUGE = 1e100  # a multiplier in the place of infinity
 _LEAST_WEIGHT = 1e-30  # counts as 0 but keeps quotients finite
 _LEAST_METRIC = 1e-150  # of a coordinate that jumps; squares of its inverse stay finite
-_LEAST_MULTIPLIER = 1e-100
+_LEAST_MULTIPLIER = 1e-100  # a Newton step from 0 to below this has no slope
 _JUST_BELOW = 1.0 - 2.0**-52
-# Newton needs 3 to 10 steps, rows with tied or degenerate gradients up to 30.
-_MAX_STEPS = 40
-_SETTLED = 1e-10  # relative excess from where one more Newton step is exact
+_MAX_STEPS = 40  # Newton needs 3 to 10; rows with tied or degenerate gradients up to 30
+_SETTLED = 1e-10  # relative excess below which one more Newton step is exact
 
 
 class RowProblem:
@@ -29,8 +28,8 @@ class RowProblem:
 
     With a multiplier lam on the row, each coordinate stays at `top` until lam reaches `leave`, falls linearly, and
     stays at 0 from `arrive` on; where metric is 0 it jumps. weight.a falls along lam, so the solution lies between the
-    two of the 2d breakpoints whose weight.a enclose the bound. The breakpoints `leave` are taken just before their
-    value, so that a jump is interpolated like a fall.
+    two of the 2d breakpoints whose weight.a enclose the bound. The breakpoints `leave` lie just before their value, so
+    that interpolation treats a jump like a fall.
     """
 
     def __init__(self, target: Tensor, weight: Tensor, bound: Tensor | float, top: float = 1.0):
@@ -48,14 +47,14 @@ class RowProblem:
         leave = (self._arrive - width).mul_(_JUST_BELOW)
         turns = torch.cat((leave, self._arrive), -1).clamp_(min=0.0)
         value = (self._shares(turns, over_width) * self._drop).sum(-1)  # weight.a at each breakpoint
-        # Enclosed by lam and not by value: breakpoints far apart may have values equal to rounding.
+        # lam decides what encloses, not the value: breakpoints far apart may have values equal to rounding.
         over = value > self.bound
         last_over = (turns * over).amax(-1, keepdim=True)
         first_under = turns.masked_fill(over, _HUGE).amin(-1, keepdim=True)
         ends = self._shares(torch.cat((last_over, first_under), -1), over_width)
         start, end = ends.unbind(-2)
         above, below = (ends * self._drop).sum(-1, keepdim=True).unbind(-2)
-        # Measured from below, a coordinate that the row presses against 0 keeps its relative precision.
+        # From below: a coordinate that the row presses against 0 keeps its relative precision.
         part = (self.bound - below) / (above - below).clamp_(min=_TINY)
         return RowSolution(self, torch.lerp(end, start, part.clamp_(max=1.0)), above > self.bound)
 
@@ -77,7 +76,7 @@ class RowSolution(NamedTuple):
         return self.share if self.problem.top == 1.0 else self.share * self.problem.top
 
     def moves(self) -> Tensor:
-        """Which coordinates (..., d) move with their target. One that rests at 0 does where nothing presses it."""
+        """Which coordinates (..., d) move with their target. A coordinate at 0 moves unless the row presses it."""
         rests = (self.problem.target >= 0.0) & ~self.held
         return ((self.share > 0.0) | rests) & (self.share < 1.0)
 
@@ -116,18 +115,19 @@ def minimize_under_ellipse(
 ) -> tuple[Tensor, RowSolution | BoxSolution, Tensor]:
     """Minimiser of sum(shift a^2 / 2 - target a) over the problem's set and sum(scale a^2) <= bound.
 
-    scale (..., d) >= 0, target >= 0. It is the problem's solution for the metric shift + mu scale. Returns the
-    minimiser (..., d), that solution, which says what holds the minimiser, and the ellipse's multiplier mu (..., 1),
-    0 where the ellipse does not.
+    scale (..., d) >= 0, target >= 0. The minimiser is the problem's solution for the metric shift + mu scale. Returns
+    the minimiser (..., d), that solution, which tells the active constraints, and the ellipse's multiplier mu
+    (..., 1), 0 where the ellipse is not active.
 
-    The dual function is concave in mu, so the ellipse's value falls along mu: Newton's method on 1 / sqrt(value of the
-    free coordinates), which is linear in mu for a sphere, within a bracket. Since scale_i a_i <= target_i / mu, the
-    multiplier is at most |target|_1 / bound.
+    The dual function is concave in mu, so the ellipse's value falls along mu. Its root is found by Newton's method on
+    1 / sqrt(value of the free coordinates), which is linear in mu for a sphere, within a bracket. Since
+    scale_i a_i <= target_i / mu, the multiplier is at most |target|_1 / bound.
     """
     target = problem.target
     high = target.sum(-1, keepdim=True) / bound
     low = mu = torch.zeros_like(high)
-    # Where Newton's step leaves the bracket, its geometric middle; the first such is at a guess for the ellipse alone.
+    # Where Newton's step leaves the bracket, the geometric middle replaces it. The first middle is a guess for the
+    # ellipse alone.
     guess_square = (target.square() / scale.clamp(min=bound)).sum(-1, keepdim=True) / bound
     floor = guess_square / high.clamp(min=_TINY)
     for _ in range(_MAX_STEPS):
@@ -137,7 +137,7 @@ def minimize_under_ellipse(
         pull = scale * point
         energy = pull * point
         excess = energy.sum(-1, keepdim=True) - bound
-        # An ellipse that holds nothing back at mu = 0 closes its bracket there.
+        # An inactive ellipse closes its bracket at mu = 0.
         over = excess > 0.0
         low, high = torch.where(over, mu, low), torch.where(over, high, mu)
 
@@ -151,17 +151,18 @@ def minimize_under_ellipse(
         newton = torch.addcmul(mu, rate, (moving / (moving - excess)).sqrt_() - 1.0)
         middle = (torch.maximum(low, torch.minimum(floor, 1e-3 * high)) * high).sqrt_()
         unsettled = (excess.abs() > _SETTLED * bound) & (high > 0.0)
-        # From mu = 0 a jump has no slope: what Newton makes of it is next to 0.
+        # A jump has no slope at mu = 0: Newton's step from there ends next to 0.
         better = (newton > low + _LEAST_MULTIPLIER) & (newton < high)
         following = torch.where(better, newton, torch.where(unsettled, middle, mu))
         step, mu = (following - mu).masked_fill(unsettled, 0.0), following
-        # Asking a GPU would cost more than it saves, and a graph cannot be captured with the question.
+        # A GPU does all steps: waiting for its answer costs more than it saves, and no CUDA graph can hold it.
         if target.is_cpu and not unsettled.any():
             break
     # The last step is so small that its first order is exact.
     point = (point - step * fall).clamp_(0.0, 1.0)
     if not target.is_cpu or unsettled.any():
-        # The value jumps over the bound, where the gradient of an oracle ties with the row: between the two sides.
+        # Where the gradient of an oracle ties with the row, the value jumps over the bound. The minimiser lies between
+        # the two sides of the jump.
         start, end = (problem.solve(multiplier * scale + shift).point for multiplier in (low, high))
         way = start - end
         lean, size = (scale * end * way).sum(-1, keepdim=True), (scale * way.square()).sum(-1, keepdim=True)

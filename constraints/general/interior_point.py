@@ -1,8 +1,8 @@
 """Second-order cone programs in batch, by a primal-dual interior-point method.
 
 Mehrotra's predictor-corrector steps with Nesterov and Todd's scaling (Vandenberghe 2010, "The CVXOPT linear and
-quadratic cone program solvers"). An ellipse is a cone here, not a smooth function of the point: Newton's steps on the
-function's own optimality conditions can come to rest at the boundary of a thin set, far from the solution.
+quadratic cone program solvers"). It treats an ellipse as a cone. As a smooth function of the point, an ellipse could
+stop Newton's steps at the boundary of a thin set, far from the solution.
 """
 
 from __future__ import annotations
@@ -10,14 +10,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_MAX_STEPS = 60
-_PATIENCE = 8
-_RESIDUAL = 100.0  # allowed in proportion to the gap
-# A sample that stalls at the limits of its conditioning has converged if it came this near to the above.
-_ACCEPTED = 1e3
+from constraints.numerics import times
+
+_MAX_STEPS = 60  # 10 to 20 are enough in most cases
+_PATIENCE = 8  # steps without progress after which a sample ends
+_RESIDUAL = 100.0  # the residual may be this many times the gap
+_ACCEPTED = 1e3  # a sample that stalls has converged if its error is below this many times the accuracy
 
 
-def minimize(
+def solve_cone_programs(
     curvature: Tensor,
     gradient: Tensor,
     rows: Tensor,
@@ -30,10 +31,10 @@ def minimize(
     """argmin y (n, d) of curvature |y|^2 / 2 - <gradient, y> subject to rows (n, m, d) @ y <= bounds (n, m) and
     u_0 >= |(u_1, ..., u_q)| for u = offset (n, k, 1 + q) - matrix (n, k, 1 + q, d) @ y.
 
-    curvature is (n, 1), gradient and start, any point, are (n, d). The objective and constraints should be of
-    order 1. A sample ends where the mean product of slack and multiplier is `accuracy`. Also returns the multipliers
-    (n, m + k) of the rows and the u_0, and whether (n,) the method converged; where it did not, the point is the best
-    one of those it came to. From a strictly feasible start all points are feasible.
+    curvature is (n, 1); gradient and start, any point, are (n, d). The objective and constraints should be of order 1.
+    A sample ends when the mean product of slack and multiplier is `accuracy`. Also returns the multipliers (n, m + k)
+    of the rows and the u_0, and whether (n,) the method converged. Where it did not, the point is the best one that it
+    found. From a strictly feasible start, all points are feasible.
     """
     m, (k, q, dim) = rows.shape[1], matrix.shape[1:]
     count = len(rows)
@@ -44,24 +45,24 @@ def minimize(
     unit[:, :m] = 1.0
     unit[:, m::q] = 1.0
 
-    def cones(vector: Tensor) -> Tensor:
+    def cone_part(vector: Tensor) -> Tensor:
         return vector[:, m:].unflatten(1, (k, q))
 
     # On the central path but for the gradient: every slack times its multiplier is the set's size.
     point = start
-    slack = limits - _times(stacked, point)
-    tail = torch.linalg.vector_norm(cones(slack)[..., 1:], dim=-1)
+    slack = limits - times(stacked, point)
+    tail = torch.linalg.vector_norm(cone_part(slack)[..., 1:], dim=-1)
     depth = torch.cat((slack[:, :m], slack[:, m::q] - tail), 1).amin(-1, keepdim=True)
     slack = slack + torch.where(depth > 0.0, 0.0, 1.0 - depth) * unit
-    cone = cones(slack)
-    mirrored = torch.cat((cone[..., :1], -cone[..., 1:]), -1) / _size(cone).square()
+    cone = cone_part(slack)
+    mirrored = torch.cat((cone[..., :1], -cone[..., 1:]), -1) / _cone_size(cone).square()
     dual = slack.amax(-1, keepdim=True) * torch.cat((1.0 / slack[:, :m], mirrored.flatten(1)), 1)
     best, best_dual = point.clone(), dual.clone()
     least, improved = torch.full((count,), torch.inf, dtype=rows.dtype), torch.zeros(count, dtype=torch.long)
     sample = torch.arange(count)  # the samples still at work
     for number in range(_MAX_STEPS):
-        stationary = curvature * point - gradient + _times(stacked.mT, dual)
-        infeasible = slack + _times(stacked, point) - limits
+        stationary = curvature * point - gradient + times(stacked.mT, dual)
+        infeasible = slack + times(stacked, point) - limits
         gap = (slack * dual).sum(-1) / (m + k)
         residual = torch.maximum(stationary.abs().amax(-1), infeasible.abs().amax(-1))
         error = torch.maximum(gap, residual / _RESIDUAL)
@@ -73,7 +74,7 @@ def minimize(
             error[better],
             number,
         )
-        # What has not come nearer for a while, or is not finite any more, has reached the limit of its conditioning.
+        # A sample without progress, or with a value that is not finite, has reached the limit of its conditioning.
         live = (
             ((least[sample] > accuracy) & error.isfinite() & (number - improved[sample] < _PATIENCE))
             .nonzero()
@@ -88,7 +89,7 @@ def minimize(
 
         scaling = _Scaling(slack, dual, m, k)
         scaled = scaling.divide(stacked)
-        # Its normal equations would square the condition number.
+        # By QR: the normal equations would square the condition number.
         basis, triangle = torch.linalg.qr(torch.cat((scaled, root), 1))
         basis = basis[:, : scaled.shape[1]]
         shift = scaling.divide(infeasible.unsqueeze(-1)).squeeze(-1)
@@ -100,7 +101,7 @@ def minimize(
             right = torch.linalg.solve_triangular(triangle.mT, -stationary.unsqueeze(-1), upper=False)
             right = right - basis.mT @ (shift - complementarity).unsqueeze(-1)
             move = torch.linalg.solve_triangular(triangle, right, upper=True).squeeze(-1)
-            dual_move = _times(scaled, move) + shift - complementarity
+            dual_move = times(scaled, move) + shift - complementarity
             return move, -complementarity - dual_move, dual_move
 
         middle = scaling.middle
@@ -113,32 +114,34 @@ def minimize(
         length = scaling.longest(slack_move, dual_move, 0.99)
 
         point = point + length * move
-        slack = slack - length * (infeasible + _times(stacked, move))
+        slack = slack - length * (infeasible + times(stacked, move))
         dual = dual + length * scaling.divide(dual_move.unsqueeze(-1)).squeeze(-1)
     return best, torch.cat((best_dual[:, :m], best_dual[:, m::q]), 1), least <= _ACCEPTED * accuracy
 
 
 class _Scaling:
-    """Nesterov and Todd's W, with W z = s / W = `middle`, of slacks s and multipliers z (n, m + k (1 + q)): a diagonal
-    on the rows, and on each cone a hyperbolic rotation w times a factor."""
+    """Nesterov and Todd's W of slacks s and multipliers z (n, m + k (1 + q)), with W z = W^-1 s = `middle`.
+
+    It is a diagonal on the rows, and a hyperbolic rotation times a factor on each cone.
+    """
 
     def __init__(self, slack: Tensor, dual: Tensor, m: int, k: int):
         self.m, self.k = m, k
         self.diagonal = (slack[:, :m] / dual[:, :m]).sqrt()
-        cone, cone_dual = self._cones(slack), self._cones(dual)
-        size, dual_size = _size(cone), _size(cone_dual)
+        cone, cone_dual = self._cone_part(slack), self._cone_part(dual)
+        size, dual_size = _cone_size(cone), _cone_size(cone_dual)
         self.factor = (size / dual_size).sqrt()
         cone, cone_dual = cone / size, cone_dual / dual_size
         twice = (2.0 + 2.0 * (cone * cone_dual).sum(-1, keepdim=True)).sqrt()
         first = (cone[..., :1] + cone_dual[..., :1]) / twice
         self.rotation = first, (cone[..., 1:] - cone_dual[..., 1:]) / twice
         self.middle = self.multiply(dual)
-        self.middle_size = _size(self._cones(self.middle))
+        self.middle_size = _cone_size(self._cone_part(self.middle))
 
     def multiply(self, vector: Tensor) -> Tensor:
         """W v for vectors (n, m + k (1 + q))."""
         first, rest = self.rotation
-        cone = self._cones(vector)
+        cone = self._cone_part(vector)
         head, tail = cone[..., :1], cone[..., 1:]
         along = (rest * tail).sum(-1, keepdim=True)
         out = torch.cat((first * head + along, tail + (head + along / (1.0 + first)) * rest), -1)
@@ -147,7 +150,7 @@ class _Scaling:
     def divide(self, columns: Tensor) -> Tensor:
         """W^-1 of columns (n, m + k (1 + q), c)."""
         first, rest = (part.unsqueeze(-1) for part in self.rotation)
-        cone = self._cones(columns)
+        cone = self._cone_part(columns)
         head, tail = cone[:, :, :1], cone[:, :, 1:]
         along = (rest * tail).sum(2, keepdim=True)
         out = torch.cat((first * head - along, tail + (along / (1.0 + first) - head) * rest), 2)
@@ -156,25 +159,25 @@ class _Scaling:
 
     def product(self, left: Tensor, right: Tensor) -> Tensor:
         """Jordan product (n, m + k (1 + q))."""
-        a, b = self._cones(left), self._cones(right)
+        a, b = self._cone_part(left), self._cone_part(right)
         out = torch.cat(((a * b).sum(-1, keepdim=True), a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:]), -1)
         return torch.cat((left[:, : self.m] * right[:, : self.m], out.flatten(1)), 1)
 
     def quotient(self, vector: Tensor) -> Tensor:
         """v with `product(middle, v)` = vector."""
-        cone, value = self._cones(self.middle), self._cones(vector)
+        cone, value = self._cone_part(self.middle), self._cone_part(vector)
         across = (cone[..., 1:] * value[..., 1:]).sum(-1, keepdim=True)
         head = (cone[..., :1] * value[..., :1] - across) / self.middle_size.square()
         out = torch.cat((head, (value[..., 1:] - head * cone[..., 1:]) / cone[..., :1]), -1)
         return torch.cat((vector[:, : self.m] / self.middle[:, : self.m], out.flatten(1)), 1)
 
     def longest(self, slack_move: Tensor, dual_move: Tensor, share: float) -> Tensor:
-        """Step length (n, 1) up to 1 that goes `share` of the way to where a slack or a multiplier leaves its cone."""
+        """Step length (n, 1), at most 1: `share` of the way on which slacks and multipliers stay in their cones."""
         moves = torch.stack((slack_move, dual_move), 1)
         rows = -moves[..., : self.m] / self.middle[:, None, : self.m]
         moved = moves[..., self.m :].unflatten(2, (self.k, -1))
         size = self.middle_size.unsqueeze(1)
-        cone = self._cones(self.middle).unsqueeze(1) / size
+        cone = self._cone_part(self.middle).unsqueeze(1) / size
         first, rest = cone[..., :1], cone[..., 1:]
         head = first * moved[..., :1] - (rest * moved[..., 1:]).sum(-1, keepdim=True)
         tail = moved[..., 1:] - (head + moved[..., :1]) / (first + 1.0) * rest
@@ -182,15 +185,11 @@ class _Scaling:
         inverse = torch.maximum(rows.flatten(1).amax(-1), out.flatten(1).amax(-1)).unsqueeze(-1)
         return share / inverse.clamp(min=share)
 
-    def _cones(self, vector: Tensor) -> Tensor:
+    def _cone_part(self, vector: Tensor) -> Tensor:
         return vector[:, self.m :].unflatten(1, (self.k, -1))
 
 
-def _size(cone: Tensor) -> Tensor:
+def _cone_size(cone: Tensor) -> Tensor:
     """sqrt(u_0^2 - |u_1, ..., u_q|^2) (..., 1) of points (..., 1 + q) in the cone."""
     head, tail = cone[..., :1], torch.linalg.vector_norm(cone[..., 1:], dim=-1, keepdim=True)
     return ((head - tail) * (head + tail)).sqrt()
-
-
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)

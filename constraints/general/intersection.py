@@ -7,15 +7,16 @@ from torch import Tensor
 
 from constraints.base import Constraint, ExplicitSet
 from constraints.errors import name_samples, require
-from constraints.general import ON_BOUNDARY, GeneralConstraint, check_obs
+from constraints.general.base import ON_BOUNDARY, GeneralConstraint, check_obs
 
 
 class Intersection(GeneralConstraint):
-    """What all of `constraints` allow; any constraint of this package, a user's own, or another intersection.
+    """The actions that all of `constraints` allow.
 
-    `penalty` is the sum of the constraints' penalties, `violation` the largest violation. `center` is the Chebyshev
-    centre if all are linear; with an ellipse it is the origin where that is interior, and the point deepest in the set
-    elsewhere. Methods raise a ConstraintError as those of LinearConstraint and QuadraticConstraint do.
+    Each is a constraint of this package, a user's own with `explicit`, or another intersection; ValueError for none, or
+    for different dimensions. `penalty` is the sum of their penalties, `violation` the largest violation. `center` is
+    the Chebyshev centre if all are linear. With an ellipse it is the origin where that is interior, otherwise the point
+    deepest in the set. Methods raise a ConstraintError as those of LinearConstraint and QuadraticConstraint do.
     """
 
     def __init__(self, *constraints: Constraint):
@@ -30,10 +31,11 @@ class Intersection(GeneralConstraint):
     def explicit(self, obs: Tensor) -> ExplicitSet:
         check_obs(obs)
         parts = [constraint.explicit(obs) for constraint in self.constraints]
-        lead = torch.broadcast_shapes(*(rows.shape[:-2] for rows, _, _ in parts), *(b.shape[:-1] for _, b, _ in parts))
-        rows = torch.cat([rows.expand(*lead, *rows.shape[-2:]) for rows, _, _ in parts], -2)
-        bounds = torch.cat([bounds.expand(*lead, bounds.shape[-1]) for _, bounds, _ in parts], -1)
-        return rows, bounds, [ellipse for _, _, ellipses in parts for ellipse in ellipses]
+        leads = [lead for part in parts for lead in (part.rows.shape[:-2], part.bounds.shape[:-1])]
+        lead = torch.broadcast_shapes(*leads)
+        rows = torch.cat([part.rows.expand(*lead, *part.rows.shape[-2:]) for part in parts], -2)
+        bounds = torch.cat([part.bounds.expand(*lead, part.bounds.shape[-1]) for part in parts], -1)
+        return ExplicitSet(rows, bounds, [ellipse for part in parts for ellipse in part.ellipses])
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         check_obs(obs)
@@ -48,7 +50,7 @@ class Intersection(GeneralConstraint):
         check_obs(obs)
         gradients = []
         for constraint in self.constraints:
-            # The closed forms take the centre's word for it.
+            # The closed forms do not check the centre.
             if not isinstance(constraint, GeneralConstraint) and center is not None:
                 inside = constraint._violation(obs, center) < -ON_BOUNDARY
                 require(inside.flatten(), "the centre is not interior", name_samples(tuple(inside.shape)))

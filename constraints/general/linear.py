@@ -1,4 +1,4 @@
-"""Half-spaces of one's own: A(obs) a <= b(obs) in the box, any number of rows."""
+"""Half-spaces of one's own: A(obs) a <= b(obs) in the box, with any number of rows."""
 
 from __future__ import annotations
 
@@ -7,17 +7,20 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from constraints.base import ExplicitSet, safe_sqrt
+from constraints.base import ExplicitSet
 from constraints.errors import name_samples, require
-from constraints.general import ON_BOUNDARY, GeneralConstraint, check_obs, checked, unit_rows
+from constraints.general.base import ON_BOUNDARY, GeneralConstraint, check_obs, checked
+from constraints.general.scaled_sets import unit_rows
+from constraints.numerics import safe_sqrt, times
 
 
 class LinearConstraint(GeneralConstraint):
     """A(obs) a <= b(obs) in the box [-1, 1]^dim.
 
-    Give A and b as functions, or override them in a subclass. `center` is the Chebyshev centre. Methods raise a
-    ConstraintError that names the sample, and the row where there is one, for NaN or infinite observations or
-    coefficients, wrong shapes and an empty set; `center` and what needs one also for a set without interior.
+    Pass A and b as functions, or override them in a subclass; TypeError where one is missing. `center` is the Chebyshev
+    centre. Methods raise a ConstraintError for NaN or infinite observations or coefficients, wrong shapes and an empty
+    set; `center`, and methods that need one, also for a set without interior. It names the sample, and the row where
+    there is one.
     """
 
     def __init__(
@@ -45,12 +48,13 @@ class LinearConstraint(GeneralConstraint):
         check_obs(obs)
         rows = checked(self.A(obs), "A(obs)", (-1, self.dim), obs)
         bounds = checked(self.b(obs), "b(obs)", (rows.shape[-2],), obs)
-        return rows, bounds, []
+        return ExplicitSet(rows, bounds, [])
 
     def _excess(self, obs: Tensor, action: Tensor) -> Tensor:
         """Ax - b (..., m) with unit rows."""
-        rows, bounds = unit_rows(*self.explicit(obs)[:2])
-        return (rows @ action.unsqueeze(-1)).squeeze(-1) - bounds
+        written = self.explicit(obs)
+        rows, bounds = unit_rows(written.rows, written.bounds)
+        return times(rows, action) - bounds
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         excess = self._excess(obs, action)
@@ -60,13 +64,14 @@ class LinearConstraint(GeneralConstraint):
         return safe_sqrt(self._excess(obs, action).clamp(min=0.0).square().sum(-1))
 
     def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        rows, bounds = unit_rows(*self.explicit(obs)[:2])
+        written = self.explicit(obs)
+        rows, bounds = unit_rows(written.rows, written.bounds)
         lead, m = direction.shape[:-1], rows.shape[-2]
         rows, slack = rows.expand(*lead, m, self.dim), bounds.expand(*lead, m)
         if m == 0:
             return []
         if center is not None:
-            slack = slack - (rows @ center.unsqueeze(-1)).squeeze(-1)
+            slack = slack - times(rows, center)
         # 0 <= 0 holds everywhere.
         vacuous = (rows == 0.0).all(-1) & (slack >= 0.0)
         inside = vacuous | (slack > ON_BOUNDARY)

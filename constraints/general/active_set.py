@@ -1,7 +1,7 @@
 """Exact projection on polyhedra, in batch, by the dual active-set method of Goldfarb and Idnani (1983).
 
-It starts at the point itself, adds the most violated row and drops rows whose multiplier would turn negative, so it
-needs no interior, ends after finitely many steps at the solution to rounding, and proves a set empty.
+It starts at the point itself, adds the most violated row and drops rows whose multiplier would turn negative. So it
+needs no interior, ends after finitely many steps, is exact to rounding, and proves a set empty.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from constraints.errors import ConstraintError, SampleName
+from constraints.general.scaled_sets import EMPTY
 
-# Rows whose part outside the span of the active ones is shorter than this count as dependent on them.
+# A row depends on the active ones where its part outside their span is shorter than this.
 _DEPENDENT = 1e-9
-# An excess that no step can remove up to this size is rounding, above it the set is empty.
-EMPTY = 1e-8
+# A multiplier that falls more slowly than this along a step does not fall.
+_FALLS = 1e-12
 
 
 def project_on_rows(
@@ -22,13 +23,13 @@ def project_on_rows(
 ) -> tuple[Tensor, Tensor]:
     """Closest point (n, d) to target (n, d) with rows (n, m, d) @ a <= bounds (n, m), and its multipliers (n, m).
 
-    Rows have unit norm or are 0. The rows with a positive multiplier are linearly independent. A ConstraintError says
-    which sample's set is empty, and which row shows it, if that is one of the first `named` ones.
+    Rows have unit norm or are 0. The rows with a positive multiplier are linearly independent. A ConstraintError names
+    a sample whose set is empty, and the row that shows it if that is one of the first `named` ones.
     """
     count, m, dim = rows.shape
     multipliers = torch.zeros(count, m, dtype=rows.dtype)
     solution = target.clone()
-    # State of the samples that are still at work; active rows fill the slots from the left.
+    # State of the unfinished samples; active rows fill the slots from the left.
     sample = torch.arange(count)
     point, limits = target.clone(), bounds.clone()
     normals = torch.zeros(count, dim, dim, dtype=rows.dtype)  # (sample, slot, coordinate)
@@ -70,17 +71,17 @@ def project_on_rows(
         length = step.square().sum(-1)
         dependent = (length <= _DEPENDENT**2) | (used.sum(-1) == dim)
 
-        ratio = torch.where(used & (within > 1e-12), weight / within, torch.inf)
+        ratio = torch.where(used & (within > _FALLS), weight / within, torch.inf)
         until_drop, leaving = ratio.min(-1)
         until_met = torch.where(dependent, torch.inf, over.clamp(min=0.0) / length)
         stuck = until_drop.isinf() & until_met.isinf()
         if bool((stuck & (over > EMPTY)).any()):
             first = int((stuck & (over > EMPTY)).nonzero()[0])
-            # The row that cannot be met or one of those in its way, the box's aside.
+            # The row that cannot be met, or one that is in its way; not a row of the box.
             conflict = [row for row in [int(entering[first]), *index[first].tolist()] if 0 <= row < named]
             which = f", row {conflict[0]}" if conflict else ""
             raise ConstraintError(f"{name(int(sample[first]))}{which}: the set is empty")
-        # A dependent row that the active ones meet up to rounding is met.
+        # The active rows meet a dependent row up to rounding: raise its limit.
         limits[stuck.nonzero().squeeze(-1), entering[stuck]] += over[stuck].clamp(min=0.0) + tolerance[stuck]
 
         size = torch.where(stuck, 0.0, torch.minimum(until_drop, until_met)).unsqueeze(-1)
@@ -96,12 +97,12 @@ def project_on_rows(
         normals[where, slot[where]] = normal[where]
         index[where, slot[where]] = entering[where]
         weight[where, slot[where]] = entered[where]
-        # A row rejected as dependent gives back the multiplier that it had gained, which is rounding.
+        # A row rejected as dependent loses the multiplier that it gained, which is rounding.
         index[drop.nonzero().squeeze(-1), leaving[drop]] = -1
         order = (index < 0).long().argsort(stable=True, dim=-1)
         index, weight = index.gather(-1, order), weight.gather(-1, order)
         normals = normals.take_along_dim(order.unsqueeze(-1), 1) * (index >= 0).unsqueeze(-1)
-        # Steps from far away leave their rounding on the active rows: back on them.
+        # Steps from far away leave the active rows by their rounding. Return to them.
         offset = limits.gather(-1, index.clamp(min=0)) - (normals @ point.unsqueeze(-1)).squeeze(-1)
         offset = torch.where(index >= 0, offset, 0.0).unsqueeze(-1)
         gram = normals @ normals.mT + torch.diag_embed((index < 0).to(rows.dtype))

@@ -7,10 +7,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from constraints.base import ExplicitSet
+from constraints.base import Ellipse, ExplicitSet
 from constraints.ellipse import ellipse_excess, ellipse_gauge_gradient
 from constraints.errors import name_samples, require
-from constraints.general import ON_BOUNDARY, GeneralConstraint, check_obs, checked
+from constraints.general.base import ON_BOUNDARY, GeneralConstraint, check_obs, checked
+from constraints.numerics import times
 
 # Asymmetry and negative eigenvalues of Q up to this share of its largest entry are rounding, in float32 too.
 _ROUNDING = 1e-6
@@ -21,11 +22,12 @@ Coefficient = Callable[[Tensor], Tensor]
 class QuadraticConstraint(GeneralConstraint):
     """(a - c(obs))' Q(obs) (a - c(obs)) <= bound(obs) in the box [-1, 1]^dim, Q positive semi-definite, bound > 0.
 
-    Give Q, bound (a function or a number) and c (default: the origin), or override them in a subclass. `center` is c,
-    or where c is not inside the box the point deepest in the set. Methods raise a ConstraintError that names the sample
-    for NaN or infinite observations or coefficients, wrong shapes, a Q that is not positive semi-definite, a bound that
-    is not positive, and an empty set; `center` and what needs one also for a set without interior (nowhere deeper than
-    1e-9), `project` and `linear_oracle` only where such a set leaves no unique multipliers.
+    Pass Q, bound (a function or a number) and c (default: the origin), or override them in a subclass; TypeError where
+    Q or bound is missing. `center` is c, or the point deepest in the set where c is not inside the box. Methods raise a
+    ConstraintError that names the sample for NaN or infinite observations or coefficients, wrong shapes, a Q that is
+    not positive semi-definite, a bound that is not positive, and an empty set. A set without interior is nowhere deeper
+    than 1e-9: `center`, and methods that need one, raise for it, `project` and `linear_oracle` only where it leaves no
+    unique multipliers.
     """
 
     def __init__(
@@ -55,7 +57,7 @@ class QuadraticConstraint(GeneralConstraint):
         return obs.new_zeros(self.dim) if self._c is None else self._c(obs)
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
-        return obs.new_zeros(0, self.dim), obs.new_zeros(0), [self._ellipse(obs)]
+        return ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [Ellipse(*self._ellipse(obs))])
 
     def _ellipse(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Q, c and the bound, checked."""
@@ -79,17 +81,13 @@ class QuadraticConstraint(GeneralConstraint):
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         matrix, center, bound = self._ellipse(obs)
         offset = action - center
-        value = (offset * (matrix @ offset.unsqueeze(-1)).squeeze(-1)).sum(-1)
+        value = (offset * times(matrix, offset)).sum(-1)
         return ellipse_excess(value, matrix.diagonal(dim1=-2, dim2=-1).sum(-1), bound, self.dim)
-
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        return self._violation(obs, action).clamp(min=0.0)
 
     def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         matrix, middle, bound = self._ellipse(obs)
         offset = (-middle if center is None else center - middle).expand_as(direction)
-        bent = (matrix @ offset.unsqueeze(-1)).squeeze(-1)
+        bent = times(matrix, offset)
         inside = (bent * offset).sum(-1) < bound * (1.0 - ON_BOUNDARY)
         require(inside.flatten(), "the centre is not inside the ellipse", name_samples(tuple(inside.shape)))
-        bent_direction = (matrix @ direction.unsqueeze(-1)).squeeze(-1)
-        return [ellipse_gauge_gradient(direction, bent_direction, offset, bent, bound.unsqueeze(-1))]
+        return [ellipse_gauge_gradient(direction, times(matrix, direction), offset, bent, bound.unsqueeze(-1))]

@@ -1,0 +1,93 @@
+"""What sets of one's own share, and checks of what the user's functions return."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from constraints.base import Constraint
+from constraints.errors import ConstraintError, name_samples, require
+from constraints.general.centers import chebyshev_centers, interior_points
+from constraints.general.linear_programs import maximize_on_rows
+from constraints.general.projection import closest_points, optimal_points, projection_jacobian
+from constraints.general.scaled_sets import ScaledSets, scale_sets
+from constraints.jacobian import JacobianProduct
+from constraints.numerics import times
+
+# A centre given for a gauge that is nearer than this to the boundary is on it, up to rounding.
+ON_BOUNDARY = 1e-12
+
+
+class GeneralConstraint(Constraint):
+    """A set that `explicit(obs)` writes out. A subclass adds that, `_violation` and `_gauge_gradients`."""
+
+    origin_centered = False
+    solved_on_cpu = True
+
+    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
+        if center is not None:
+            inside = center.abs().amax(-1) < 1.0 - ON_BOUNDARY
+            require(inside.flatten(), "the centre is not inside the box", name_samples(tuple(inside.shape)))
+            center = center.expand_as(direction)
+        return super()._gauge_and_gradient(obs, direction, center)
+
+    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        sets = self._scaled_sets(obs, action.shape[:-1])
+        target = action.reshape(-1, self.dim).cpu()
+        finite = target.isfinite().all(-1, keepdim=True)
+        solution, metric, multipliers = closest_points(sets, torch.where(finite, target, 0.0))
+
+        def product(vector: Tensor) -> Tensor:
+            jacobian = projection_jacobian(sets, solution, metric, multipliers)
+            return times(jacobian, vector.reshape(-1, self.dim).cpu()).view(vector.shape).to(vector)
+
+        # There is no closest point to an infinite one.
+        answer = torch.where(finite, solution, torch.nan)
+        return answer.view(action.shape).to(action.device), product
+
+    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
+        sets = self._scaled_sets(obs, gradient.shape[:-1])
+        slope = gradient.reshape(-1, self.dim).cpu()
+        size = slope.abs().amax(-1, keepdim=True)
+        finite = size.isfinite()
+        slope = torch.where(finite & (size > 0.0), slope / size, 0.0)
+        solution = optimal_points(sets, slope, linear=True)[0] if sets.curved else maximize_on_rows(sets, slope)
+        return torch.where(finite, solution, torch.nan).view(gradient.shape).to(gradient.device)
+
+    def _center(self, obs: Tensor) -> Tensor:
+        sets = self._scaled_sets(obs, obs.shape[:-1])
+        center = interior_points(sets) if sets.curved else chebyshev_centers(sets)
+        return center.view(*obs.shape[:-1], self.dim).to(obs.device)
+
+    def _scaled_sets(self, obs: Tensor, lead: tuple[int, ...]) -> ScaledSets:
+        return scale_sets(self.explicit(obs), lead)
+
+
+def check_obs(obs: Tensor) -> None:
+    """Raise a ConstraintError for a NaN or infinite observation."""
+    valid = obs.isfinite().all(-1)
+    require(valid.flatten(), "the observation is NaN or infinite", name_samples(tuple(valid.shape)))
+
+
+def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tensor) -> Tensor:
+    """Coefficients as float64 (*lead, *shape), finite and of the expected shape, or a ConstraintError.
+
+    -1 in `shape` stands for any size; lead may be the observation's leading shape or one that broadcasts to it.
+    """
+    values = torch.as_tensor(values, dtype=torch.float64, device=obs.device).detach()
+    lead = values.shape[: values.dim() - len(shape)]
+    fits = len(values.shape) >= len(shape) and all(
+        have == want or want == -1 for have, want in zip(values.shape[len(lead) :], shape, strict=True)
+    )
+    try:
+        fits = fits and torch.broadcast_shapes(lead, obs.shape[:-1]) == obs.shape[:-1]
+    except RuntimeError:
+        fits = False
+    if not fits:
+        wanted = ", ".join(["..."] + ["m" if size == -1 else str(size) for size in shape])
+        raise ConstraintError(
+            f"{what} has shape {tuple(values.shape)}, expected ({wanted}) with ... = {tuple(obs.shape[:-1])}"
+        )
+    valid = values.isfinite().flatten(len(lead)).all(-1) if shape else values.isfinite()
+    require(valid.flatten(), f"{what} is NaN or infinite", name_samples(tuple(lead)))
+    return values

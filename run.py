@@ -251,18 +251,20 @@ def _run(trainer: Trainer) -> None:
     try:
         results = trainer.run()
     except (Interrupted, KeyboardInterrupt):
+        step = max(seed.steps for seed in trainer.seeds)
         print(
-            f"\ninterrupted at step {max(trainer.steps)}; the same command resumes (without overwrite=true)"
-            f" (unfinished runs are in {trainer.writers[0].folder.parent})",
+            f"\ninterrupted at step {step}; the same command resumes (without overwrite=true)"
+            f" (unfinished runs are in {trainer.seeds[0].writer.folder.parent})",
             file=sys.stderr,
         )
         raise
-    for i, (writer, result) in enumerate(zip(trainer.writers, results, strict=True)):
+    for seed, result in zip(trainer.seeds, results, strict=True):
+        folder = seed.writer.folder
         if result is None:
-            print(f"{writer.folder}: {describe_failure(trainer.failures[i])}", file=sys.stderr)
+            print(f"{folder}: {describe_failure(seed.failure)}", file=sys.stderr)
         else:
             print(
-                f"{writer.folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
+                f"{folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
                 f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e})"
             )
 

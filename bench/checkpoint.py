@@ -25,6 +25,7 @@ import torch
 
 import run
 from core.config import saved_settings
+from core.seed import Best
 from store.checkpoint import CheckpointFolder
 from store.folder import RunWriter
 
@@ -55,7 +56,7 @@ def measure(config, count: int, folder: Path) -> None:
     trainer.replay.added = [transitions] * count
     update = min(timed(lambda: trainer.agent.update(trainer.replay.sample(config.batch_size))) for _ in range(10))
     for i in seeds:
-        trainer.best[i] = (0.0, 0, trainer.agent.state(i))
+        trainer.seeds[i].best = Best(0.0, 0, trainer.agent.state(i))
 
     before = peak()
     whole = timed(trainer._checkpoint), megabytes(folder)

@@ -23,7 +23,6 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])
 import torch
 from tqdm import tqdm
 
-import core.trainer
 import run
 from core.config import Config, ConfigError, choose, saved_settings
 from store.folder import RunWriter
@@ -38,24 +37,25 @@ def measure(config: Config) -> dict[str, object]:
     """One row of the file."""
 
     def check() -> None:
-        if trainer.gradient_steps[0] == UPDATES:
+        if trainer.seeds[0].gradient_steps == UPDATES:
             raise Interrupted(15)
 
     seeds = list(range(SEEDS))
     with tempfile.TemporaryDirectory() as folder:
         writers = [RunWriter(Path(folder, str(seed)), saved_settings(config, seed), {}, 1) for seed in seeds]
         trainer = run.make_trainer(config, seeds, writers, progress=False, check=check)
+        trainer.stopwatch.clock = time.process_time
         start = time.process_time()
         try:
             trainer.run()
         except Interrupted:
             total = time.process_time() - start
-    stepping = total - trainer.seconds["update"] - trainer.seconds["checkpoint"]
+    stepping = total - trainer.stopwatch.phases["update"] - trainer.stopwatch.phases["checkpoint"]
     return {
         "task": config.env,
         "algo": config.algo,
-        "update_ms": f"{1e3 * trainer.seconds['update'] / UPDATES:.2f}",
-        "step_ms": f"{1e3 * stepping / trainer.steps[0]:.2f}",
+        "update_ms": f"{1e3 * trainer.stopwatch.phases['update'] / UPDATES:.2f}",
+        "step_ms": f"{1e3 * stepping / trainer.seeds[0].steps:.2f}",
     }
 
 
@@ -72,7 +72,6 @@ def main(arguments: list[str]) -> int:
         return 2
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
-    core.trainer.time.perf_counter = time.process_time
     rows = [measure(config) for config, _ in tqdm(cells, unit="cell")]
     with open(options["out"], "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")

@@ -17,8 +17,8 @@ from envs import InfeasibleActionError, step_together
 class Evaluator:
     """Owns `parallel` environments a seed, made when first needed; their random streams belong to the seed.
 
-    `check` is called before every step. Whatever it or something else raises, the environments' random streams are
-    put back, so that the evaluation can be made again.
+    `stop_if_asked` is called before every step and raises to stop. Any exception puts the environments' random streams
+    back, so that the evaluation can be repeated.
     """
 
     def __init__(
@@ -26,9 +26,9 @@ class Evaluator:
         make_env: Callable[[], gymnasium.Env],
         seeds: Sequence[int],
         parallel: int,
-        check: Callable[[], None],
+        stop_if_asked: Callable[[], None],
     ):
-        self.make_env, self.seeds, self.parallel, self.check = make_env, seeds, parallel, check
+        self.make_env, self.seeds, self.parallel, self.stop_if_asked = make_env, seeds, parallel, stop_if_asked
         self.envs: dict[int, list[Any]] = {}
         self.refused: dict[int, str] = {}  # position of a seed -> why its policy's action was refused, in the last run
 
@@ -55,7 +55,7 @@ class Evaluator:
         returns = np.zeros(len(envs))
         running = list(range(len(envs)))
         while running:
-            self.check()
+            self.stop_if_asked()
             actions = policy(seen).flatten(0, 1).numpy()
             still_running = []
             outcomes = step_together([envs[k] for k in running], actions[running])

@@ -27,12 +27,13 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from core.config import ConfigError, choose, split_names
-from plots import style, tables
+import tables
+from core.words import ConfigError, parse_words, split_names
+from plots import style
 from plots.aggregates import aggregate, draw_aggregates, improvement_table, mean_table
 from plots.figures import draw_curves
 from plots.grouping import Groups, group_runs, list_left_out
-from plots.paper import order_algos, order_tasks
+from plots.paper import COLORS, order_algos, order_tasks
 from plots.rewards import comparison_table, reward_table
 from store.folder import find_runs, parse_variant, read_results
 
@@ -77,7 +78,9 @@ def _read(root: Path, options: dict[str, str]) -> Groups:
     algos_there = {parse_variant(folder.parent.name)[0] for folder in found}
     # The choices are what there is, so that a new task or algorithm needs no entry here.
     tasks = split_names(f"env in {root}", options.get("env", "all"), order_tasks(tasks_there))
-    algos = split_names(f"algo in {root}", options.get("algo", "all"), order_algos(algos_there))
+    algos = order_algos(algos_there)
+    of_paper = {"paper": [algo for algo in algos if algo in COLORS]}
+    algos = split_names(f"algo in {root}", options.get("algo", "all"), algos, of_paper)
     runs, problems = read_results(root, tasks, algos)
     groups, repeated = group_runs(runs)
     for problem in problems + repeated:
@@ -134,20 +137,9 @@ def _formats(options: dict[str, str], choices: Sequence[str]) -> list[str]:
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     """Words and options. Raises ConfigError for an unknown option, one given twice or without a value."""
-    words: list[str] = []
-    options: dict[str, str] = {}
-    for argument in arguments:
-        key, equals, value = argument.partition("=")
-        if not equals or "/" in key:  # the path of a run holds a = itself
-            words.append(argument)
-            continue
-        choose("key", key, ("env", "algo", "out", "format"))
-        if not value:
-            raise ConfigError(f"expected {key}=value, got {argument!r}")
-        if key in options:
-            raise ConfigError(f"key {key!r} given twice: {options[key]!r} and {value!r}")
-        options[key] = value
-    return words, options
+    # The path of a run holds a "=" itself, after a "/".
+    words = [argument for argument in arguments if "/" in argument.partition("=")[0] or "=" not in argument]
+    return words, parse_words((a for a in arguments if a not in words), ("env", "algo", "out", "format"))
 
 
 def _path(words: Sequence[str], what: str) -> Path:

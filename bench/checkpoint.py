@@ -23,11 +23,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import torch
 
-import run
-from core.config import saved_settings
+from core.config import Config, saved_settings
 from core.seed import Best
+from core.words import ConfigError, parse_words, whole_numbers
 from store.checkpoint import CheckpointFolder
 from store.folder import RunWriter
+from sweep.cells import make_cells
+from sweep.train import make_trainer
 
 
 def megabytes(folder: Path) -> float:
@@ -45,11 +47,11 @@ def timed(action) -> float:
     return time.perf_counter() - start
 
 
-def measure(config, count: int, folder: Path) -> None:
+def measure(config: Config, count: int, folder: Path) -> None:
     seeds = list(range(count))
     folders = [folder / f"seed={seed}" for seed in seeds]
     writers = [RunWriter(path, saved_settings(config, seed), {}, 1) for path, seed in zip(folders, seeds, strict=True)]
-    trainer = run.make_trainer(config, seeds, writers, progress=False)
+    trainer = make_trainer(config, seeds, writers, progress=False)
     trainer._begin()
     trainer.replay.rows.uniform_()
     transitions = trainer.replay.capacity
@@ -79,16 +81,23 @@ def measure(config, count: int, folder: Path) -> None:
     print(f"  resuming: {timed(resume):.1f} s", flush=True)
 
 
-def main(arguments: list[str]) -> None:
-    options = {"seeds": "1,10", "env": "HC+O", "transitions": "1e6", "folder": None}
-    options |= dict(word.split("=", 1) for word in arguments)
-    size = options["transitions"]
-    ((config, _),) = run.plan(["algo=DPre", f"env={options['env']}", f"buffer_size={size}", f"steps={size}"])
+def main(arguments: list[str]) -> int:
+    """Exit code: 0 done, 2 bad input."""
+    options = {"seeds": "1,10", "env": "HC+O", "transitions": "1e6", "folder": tempfile.gettempdir()}
+    try:
+        options |= parse_words(arguments, options)
+        size = options["transitions"]
+        (cell,) = make_cells({"algo": "DPre", "env": options["env"], "buffer_size": size, "steps": size})
+        counts = whole_numbers("seeds", options["seeds"])
+    except ConfigError as error:
+        print(f"bench/checkpoint.py: {error}", file=sys.stderr)
+        return 2
     torch.set_num_threads(1)
-    for count in map(int, options["seeds"].split(",")):
+    for count in counts:
         with tempfile.TemporaryDirectory(dir=options["folder"]) as folder:
-            measure(config, count, Path(folder))
+            measure(cell.config, count, Path(folder))
+    return 0
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

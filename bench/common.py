@@ -1,55 +1,40 @@
-"""What the benchmarks of training share: options, agents, replay buffers with real transitions, and the machine."""
+"""What the benchmarks of training share: configurations, agents, replay buffers with real transitions, the machine."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
 import envs
-import run
 from algos import ALGORITHMS
 from core.agent import Agent
-from core.config import ConfigError, choose
+from core.config import Config
 from core.random import stream_seed
 from core.replay import Batch, Replay
 from store.provenance import processor
+from sweep.cells import make_cells
 
 TASK = "HC+O"
 
 
-def parse_options(arguments: Iterable[str], defaults: Mapping[str, str]) -> dict[str, str]:
-    """`key=value` words over the `defaults`. Raises ConfigError for a word of another form or an unknown key."""
-    options = dict(defaults)
-    for argument in arguments:
-        key, equals, value = argument.partition("=")
-        if not equals or not value:
-            raise ConfigError(f"expected key=value, got {argument!r}")
-        options[choose("key", key, defaults)] = value
-    return options
-
-
-def positive(key: str, text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise ConfigError(f"bad value {text!r} for {key}: expected whole numbers from 1 on")
-    return int(text)
-
-
-def positives(key: str, text: str) -> list[int]:
-    """A comma list of whole numbers from 1 on."""
-    return [positive(key, part) for part in text.split(",")]
-
-
-def machine(device: torch.device) -> str:
+def machine_name(device: torch.device) -> str:
     """Processor, device and versions."""
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "no GPU"
     return f"{processor()}, {name}, torch {torch.__version__}"
 
 
+def make_config(algo: str, **settings: object) -> Config:
+    """The paper's configuration of `algo` on the task, with other `settings`."""
+    words = {key: str(value) for key, value in settings.items()}
+    (cell,) = make_cells({"algo": algo, "env": TASK} | words)
+    return cell.config
+
+
 def make_agent(name: str, batch: int, seeds: Sequence[int], device: torch.device | str = "cpu") -> Agent:
     """A new agent with the paper's settings for the task, the batch size apart."""
-    ((config, _),) = run.plan([f"algo={name}", f"env={TASK}", f"batch_size={batch}", f"device={device}"])
+    config = make_config(name, batch_size=batch, device=device)
     obs_dim = envs.make(TASK).observation_space.shape[0]
     return ALGORITHMS[name].build(config, envs.constraint(TASK), obs_dim, seeds)
 

@@ -47,7 +47,7 @@ from constraints import (
     WeightedL1AndEllipse,
     WeightedPositivePart,
 )
-from core.config import ConfigError, choose, split_names
+from core.words import ConfigError, parse_words, split_names, whole_numbers
 from envs import TASKS
 from envs.reacher import Reacher
 from store.provenance import processor
@@ -328,17 +328,10 @@ def table(records: list[dict], batches: list[int]) -> str:
 def choices(arguments: list[str]) -> tuple[list[str], list[int], list[str], Path]:
     """Tasks, batch sizes, baselines and the folder that the `key=value` words ask for; ConfigError for a wrong one."""
     known = {"task": "all", "batch": "1,16,100,256,2560", "baselines": "all", "out": "bench/results"}
-    for word in arguments:
-        key, equals, value = word.partition("=")
-        if not equals:
-            raise ConfigError(f"expected key=value, got {word!r}")
-        known[choose("key", key, known)] = value
-    batches = known["batch"].split(",")
-    if not all(batch.isdecimal() and int(batch) > 0 for batch in batches):
-        raise ConfigError(f"bad batch {known['batch']!r} (example: batch=1,100)")
-    names = known["baselines"]
-    solvers = split_names("baseline", names, BASELINES) if names not in ("", "none") else []
-    return split_names("task", known["task"], TASKS), [int(batch) for batch in batches], solvers, Path(known["out"])
+    known |= parse_words(arguments, known)
+    solvers = split_names("baseline", known["baselines"], BASELINES, {"none": ()})
+    tasks, batches = split_names("task", known["task"], TASKS), whole_numbers("batch", known["batch"])
+    return tasks, batches, solvers, Path(known["out"])
 
 
 def main(arguments: list[str]) -> int:

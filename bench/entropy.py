@@ -34,9 +34,8 @@ from torch.distributions import Normal
 from tqdm import tqdm
 
 import envs
-from bench.common import parse_options, positive
 from constraints import Constraint
-from core.config import ConfigError, split_names
+from core.words import ConfigError, parse_words, split_names, whole_number
 
 DIRECTIONS, SAMPLES, FRESH_SAMPLES, ASCENT_STEPS, RATE = 2**14, 512, 2**12, 200, 0.05
 MAPS = {
@@ -129,8 +128,9 @@ def main(arguments: list[str]) -> int:
         print(__doc__.strip())
         return 0
     try:
-        options = parse_options(arguments, {"task": "all", "states": "64", "out": "bench/results"})
-        states = positive("states", options["states"])
+        options = {"task": "all", "states": "64", "out": "bench/results"}
+        options |= parse_words(arguments, options)
+        states = whole_number("states", options["states"])
         tasks = split_names("task", options["task"], envs.TASKS)
         path = Path(options["out"]) / "entropy.md"
         path.parent.mkdir(parents=True, exist_ok=True)

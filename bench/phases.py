@@ -1,7 +1,8 @@
 """Where the time of a training run goes, by phase.
 
-The run is made by `run.make_trainer`, with the paper's settings on HC+O, and is 10,000 steps long. Gradient steps begin
-after 9,500 of them; TD3 takes them every 100 steps instead of once an episode of 1,000, one for each step all the same.
+The run is made by `sweep.train.make_trainer`, with the paper's settings on HC+O, and is 10,000 steps long. Gradient
+steps begin after 9,500 of them; TD3 takes them every 100 steps instead of once an episode of 1,000, one for each step
+all the same.
 It has two evaluations, a final one that is no longer than these, and two checkpoints, of all its 10,000 transitions and
 at its end.
 
@@ -26,10 +27,11 @@ from unittest.mock import patch
 
 import algos.sac
 import algos.td3
-import run
-from bench.common import TASK
-from core.config import saved_settings
+from bench.common import make_config
+from core.config import Config, saved_settings
+from core.trainer import Trainer
 from store.folder import RunWriter
+from sweep.train import make_trainer
 
 STEPS, WARM_UP = 10_000, 9_500
 """Environment steps of each seed, and those before the first gradient step."""
@@ -57,9 +59,10 @@ class Phases:
 
 
 class Stopwatch:
-    """Seconds of the calls of functions and methods, each call by itself."""
+    """Seconds of the calls of functions and methods, each call by itself, on `clock`."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.clock = clock
         self.calls: dict[str, list[float]] = defaultdict(list)
 
     def watch(self, owner: Any, name: str, phase: str) -> Any:
@@ -67,11 +70,11 @@ class Stopwatch:
         inner = getattr(owner, name)
 
         def timed(*arguments, **options):
-            start = time.perf_counter()
+            start = self.clock()
             try:
                 return inner(*arguments, **options)
             finally:
-                self.calls[phase].append(time.perf_counter() - start)
+                self.calls[phase].append(self.clock() - start)
 
         return patch.object(owner, name, timed)
 
@@ -80,25 +83,26 @@ class Stopwatch:
 
 
 @contextmanager
-def new_trainer(algo: str, seeds: Sequence[int], settings: Sequence[str], check: Callable[[], None]) -> Iterator:
-    """A trainer on the task as run.py makes it, without a progress bar, its folders deleted afterwards."""
-    ((config, _),) = run.plan([f"algo={algo}", f"env={TASK}", *settings])
+def new_trainer(
+    config: Config, seeds: Sequence[int], stop_if_asked: Callable[[], None] = lambda: None
+) -> Iterator[Trainer]:
+    """A trainer as run.py makes it, without a progress bar, whose folders are deleted afterwards."""
     with tempfile.TemporaryDirectory() as folder:
         writers = [
             RunWriter(Path(folder) / str(seed), saved_settings(config, seed), {}, config.eval_episodes)
             for seed in seeds
         ]
-        yield run.make_trainer(config, list(seeds), writers, progress=False, check=check)
+        yield make_trainer(config, seeds, writers, False, stop_if_asked)
 
 
 def measure_phases(algo: str, seeds: Sequence[int]) -> Phases:
     """Train `seeds` in lockstep and time the phases, in wall-clock seconds."""
-    settings = [f"steps={STEPS}", f"learning_starts={WARM_UP}", f"checkpoint_every={STEPS}"]
-    settings += [f"eval_every={STEPS // 2}", f"eval_episodes={EPISODES}", f"final_episodes={EPISODES}"]
+    settings = {"steps": STEPS, "learning_starts": WARM_UP, "checkpoint_every": STEPS}
+    settings |= {"eval_every": STEPS // 2, "eval_episodes": EPISODES, "final_episodes": EPISODES}
     if algo.startswith("D"):
-        settings.append("train_freq=100")
+        settings["train_freq"] = 100
     watch = Stopwatch()
-    with new_trainer(algo, seeds, settings, check=lambda: None) as trainer, ExitStack() as watched:
+    with new_trainer(make_config(algo, **settings), seeds) as trainer, ExitStack() as watched:
         agent = trainer.agent
         watches = [
             (trainer.replay, "sample", "replay sampling"),
@@ -119,15 +123,15 @@ def measure_phases(algo: str, seeds: Sequence[int]) -> Phases:
         results = trainer.run()
         total = time.perf_counter() - start
 
-    measured = {phase: trainer.stopwatch.phases[phase] for phase in ("environment", "checkpoint")}
-    measured["map"] = trainer.stopwatch.phases["acting"] - watch.seconds("exploration")
+    measured = {phase: trainer.timer.phases[phase] for phase in ("environment", "checkpoint")}
+    measured["map"] = trainer.timer.phases["acting"] - watch.seconds("exploration")
     measured |= {phase: watch.seconds(phase) for phase in (*UPDATE, *OUTSIDE) if phase not in measured}
     measured["forward and backward"] = sum(
         sign * watch.seconds(phase) for phase, sign in (("update", 1), ("optimiser", -1), ("target update", -1))
     )
     measured["everything else"] = 0.0
     measured["everything else"] = total - sum(measured.values())
-    ((protocol, _),) = run.plan([f"algo={algo}", f"env={TASK}"])
+    protocol = make_config(algo)
     learning_steps = protocol.steps - protocol.learning_starts
     factors = dict.fromkeys(OUTSIDE, protocol.steps / STEPS)
     factors |= dict.fromkeys(UPDATE, learning_steps / results[0]["gradient_steps"])

@@ -13,8 +13,8 @@ from __future__ import annotations
 import csv
 import os
 import sys
-import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -23,56 +23,54 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])
 import torch
 from tqdm import tqdm
 
-import run
-from core.config import Config, ConfigError, choose, saved_settings
-from store.folder import RunWriter
-from store.interrupt import Interrupted
+from bench.phases import Stopwatch, new_trainer
+from core.config import Config
+from core.words import ConfigError, parse_words
+from sweep.cells import make_cells
 from sweep.estimates import COLUMNS, RATES, SEEDS
 
 WARM_UP, UPDATES = 100, 20
-FIXED = f"steps=10000 learning_starts={WARM_UP} train_freq=1 gradient_steps=1"
+FIXED = {"steps": "10000", "learning_starts": str(WARM_UP), "train_freq": "1", "gradient_steps": "1"}
+
+
+class _Enough(Exception):
+    """Ends a training loop from within."""
 
 
 def measure(config: Config) -> dict[str, object]:
     """One row of the file."""
+    watch, ends = Stopwatch(time.process_time), []
 
-    def check() -> None:
-        if trainer.seeds[0].gradient_steps == UPDATES:
-            raise Interrupted(15)
+    def stop_if_asked() -> None:  # the loop calls it between any two steps
+        if len(watch.calls["update"]) == UPDATES:
+            ends.append(watch.clock())
+            raise _Enough
 
-    seeds = list(range(SEEDS))
-    with tempfile.TemporaryDirectory() as folder:
-        writers = [RunWriter(Path(folder, str(seed)), saved_settings(config, seed), {}, 1) for seed in seeds]
-        trainer = run.make_trainer(config, seeds, writers, progress=False, check=check)
-        trainer.stopwatch.clock = time.process_time
-        start = time.process_time()
-        try:
+    with new_trainer(config, range(SEEDS), stop_if_asked) as trainer:
+        start = watch.clock()
+        with watch.watch(trainer, "take_gradient_step", "update"), suppress(_Enough):
             trainer.run()
-        except Interrupted:
-            total = time.process_time() - start
-    stepping = total - trainer.stopwatch.phases["update"] - trainer.stopwatch.phases["checkpoint"]
+    update = watch.seconds("update")
     return {
         "task": config.env,
         "algo": config.algo,
-        "update_ms": f"{1e3 * trainer.stopwatch.phases['update'] / UPDATES:.2f}",
-        "step_ms": f"{1e3 * stepping / trainer.seeds[0].steps:.2f}",
+        "update_ms": f"{1e3 * update / UPDATES:.2f}",
+        "step_ms": f"{1e3 * (ends[0] - start - update) / (WARM_UP + UPDATES):.2f}",
     }
 
 
 def main(arguments: list[str]) -> int:
     """Exit code: 0 done, 2 bad input."""
-    options = {"algo": "all", "env": "all", "out": str(RATES)}
+    options = {"algo": "paper", "env": "all", "out": str(RATES)}
     try:
-        for argument in arguments:
-            key, _, value = argument.partition("=")
-            options[choose("key", key, options)] = value
-        cells = run.plan([f"algo={options['algo']}", f"env={options['env']}", *FIXED.split()])
+        options |= parse_words(arguments, options)
+        cells = make_cells({"algo": options["algo"], "env": options["env"]} | FIXED)
     except ConfigError as error:
         print(f"bench/rates.py: {error}", file=sys.stderr)
         return 2
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
-    rows = [measure(config) for config, _ in tqdm(cells, unit="cell")]
+    rows = [measure(cell.config) for cell in tqdm(cells, unit="cell")]
     with open(options["out"], "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()

@@ -35,13 +35,13 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])
 import torch
 from tqdm import tqdm
 
-import run
 from algos import ALGORITHMS
-from bench.common import TASK, fill_replay, machine, make_agent, parse_options, positive, positives
-from core.config import ConfigError, split_names
+from bench.common import TASK, fill_replay, machine_name, make_agent
 from core.cuda_graph import GradientSteps
+from core.words import ConfigError, parse_words, split_names, whole_number, whole_numbers
 from plots.runtime import COLUMNS, runtime_table
-from plots.tables import to_terminal
+from sweep.train import check_device
+from tables import to_terminal
 
 FILL = 1_000
 """Transitions of each seed in the replay buffer."""
@@ -94,17 +94,22 @@ def kernel_seconds(call: Callable[[], None]) -> float:
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], list[int], dict[str, int], str, Path]:
     """Algorithms, batch sizes, whole numbers by name, device and folder. Raises ConfigError for what is wrong."""
-    options = parse_options(arguments, DEFAULTS)
-    run.check_device(options["device"])
-    batches = positives("batch", options["batch"])
-    counts = {key: positive(key, options[key]) for key in ("trials", "steps", "seeds")}
+    options = DEFAULTS | parse_words(arguments, DEFAULTS)
+    check_device(options["device"])
+    batches = whole_numbers("batch", options["batch"])
+    counts = {key: whole_number(key, options[key]) for key in ("trials", "steps", "seeds")}
     names = split_names("algo", options["algo"], ALGORITHMS)
     return names, batches, counts, options["device"], Path(options["out"]).expanduser()
 
 
 def run_trials(names: Sequence[str], batches: Sequence[int], counts: dict[str, int], device: str, path: Path) -> None:
     """Measure every cell `trials` times and write each measurement to `path` at once."""
-    fixed = {"task": TASK, "seeds": counts["seeds"], "steps": counts["steps"], "machine": machine(torch.device(device))}
+    fixed = {
+        "task": TASK,
+        "seeds": counts["seeds"],
+        "steps": counts["steps"],
+        "machine": machine_name(torch.device(device)),
+    }
     turns = counts["trials"] * len(names) * len(batches) * math.ceil(counts["steps"] / TURN)
     with open(path, "w", newline="", encoding="utf-8") as file, tqdm(total=turns, unit="turn", smoothing=0) as bar:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")

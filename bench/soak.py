@@ -28,8 +28,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 import envs
-from core.config import ConfigError, choose, split_names
 from core.networks import MLP
+from core.words import ConfigError, parse_words, split_names, whole_number
 from envs import TASKS, TOLERANCE, InfeasibleActionError
 
 MAPS = ("project", "alpha_map", "radial_map")
@@ -168,27 +168,18 @@ def soak(tasks: list[str], steps: int, checks: int, seed: int, parallel: int = 5
     return soaks
 
 
-def choices(arguments: list[str]) -> tuple[list[str], int, int, int]:
-    """Tasks, steps, checks and seed that the `key=value` words ask for; ConfigError for a wrong one."""
+def parse_arguments(arguments: list[str]) -> tuple[list[str], int, int, int]:
+    """Tasks, steps, checks and seed that the `key=value` words ask for. Raises ConfigError for a wrong one."""
     options = {"env": "all", "steps": "1e6", "checks": "1e7", "seed": "0"}
-    for word in arguments:
-        key, equals, value = word.partition("=")
-        if not equals:
-            raise ConfigError(f"expected key=value, got {word!r}")
-        options[choose("key", key, options)] = value
-    counts = []
-    for key in ("steps", "checks", "seed"):
-        try:
-            counts.append(int(float(options[key])))
-        except ValueError:
-            raise ConfigError(f"bad value {options[key]!r} for {key}: expected a whole number") from None
-    return split_names("task", options["env"], TASKS), *counts
+    options |= parse_words(arguments, options)
+    steps, checks, seed = (whole_number(key, options[key], least=0) for key in ("steps", "checks", "seed"))
+    return split_names("task", options["env"], TASKS), steps, checks, seed
 
 
 def main(arguments: list[str]) -> int:
     """Exit code: 0 no violation, 1 violations, 2 bad input."""
     try:
-        tasks, steps, checks, seed = choices(arguments)
+        tasks, steps, checks, seed = parse_arguments(arguments)
     except ConfigError as error:
         print(f"bench/soak.py: {error}", file=sys.stderr)
         return 2

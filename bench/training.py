@@ -42,13 +42,12 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])
 import torch
 from tqdm import tqdm
 
-import run
-from bench.common import TASK, fill_replay, machine, make_agent, parse_options, positive, positives
+from bench.common import TASK, fill_replay, machine_name, make_agent, make_config
 from bench.floor import Floor, update_products
 from bench.peer import INSTALLED, Peer, peer_version
 from bench.phases import OUTSIDE, UPDATE, Phases, measure_phases, new_trainer
-from core.config import Config, ConfigError, split_names
-from plots.tables import MISSING, Table, text_cells, to_terminal, write_csv, write_table
+from core.words import ConfigError, parse_words, split_names, whole_number, whole_numbers
+from tables import MISSING, Table, text_cells, to_terminal, write_csv, write_table
 
 ALGO = {"TD3": "DPre", "SAC": "SPre"}
 TRANSITIONS = 10_000
@@ -87,11 +86,6 @@ class _Enough(Exception):
 # ---------------------------------------------------------------------------------------------------- the measurement
 
 
-def paper_config(base: str) -> Config:
-    ((config, _),) = run.plan([f"algo={ALGO[base]}", f"env={TASK}"])
-    return config
-
-
 def repeated(call: Callable[[], object], steps: int) -> Turn:
     def turn(clock: Clock) -> float:
         start = clock()
@@ -105,13 +99,13 @@ def repeated(call: Callable[[], object], steps: int) -> Turn:
 def environment_turn(base: str, seeds: int, steps: int) -> Turn:
     """Environment steps of a new trainer's loop, without gradient steps; the first ten do not count."""
     never = 10**9
-    settings = [f"{key}={never}" for key in ("steps", "train_freq", "eval_every", "checkpoint_every")]
-    settings += ["learning_starts=0", f"buffer_size={TRANSITIONS}"]
+    settings = dict.fromkeys(("steps", "train_freq", "eval_every", "checkpoint_every"), never)
+    config = make_config(ALGO[base], **settings, learning_starts=0, buffer_size=TRANSITIONS)
 
     def turn(clock: Clock) -> float:
         times: list[float] = []
 
-        def check() -> None:  # the loop calls it between any two steps
+        def stop_if_asked() -> None:  # the loop calls it between any two steps
             taken = trainer.seeds[0].steps
             if taken >= 10 and not times:
                 times.append(clock())
@@ -119,7 +113,7 @@ def environment_turn(base: str, seeds: int, steps: int) -> Turn:
                 times.append(clock())
                 raise _Enough
 
-        with new_trainer(ALGO[base], range(seeds), settings, check) as trainer, suppress(_Enough):
+        with new_trainer(config, range(seeds), stop_if_asked) as trainer, suppress(_Enough):
             trainer.run()
         return times[1] - times[0]
 
@@ -128,7 +122,7 @@ def environment_turn(base: str, seeds: int, steps: int) -> Turn:
 
 def turns(base: str, seeds: int, steps: int, peer: Peer | None) -> dict[str, Turn]:
     """What takes turns, by name; "update" and "environment" are ours."""
-    config = paper_config(base)
+    config = make_config(ALGO[base])
     agent = make_agent(ALGO[base], config.batch_size, range(seeds))
     replay = fill_replay(agent, TRANSITIONS)
     floor = Floor(update_products(base, config, agent.obs_dim, agent.action_dim, seeds))
@@ -159,7 +153,7 @@ def measure(base: str, threads: int, options: Options, cells: dict[int, dict[str
                     milliseconds[seeds][name].append(1e3 * seconds)
             bar.update()
     fixed = {"base": base, "algo": ALGO[base], "threads": threads, "rounds": options.rounds, "steps": options.steps}
-    fixed |= {"clock": clock.__name__, "machine": machine(torch.device("cpu"))}
+    fixed |= {"clock": clock.__name__, "machine": machine_name(torch.device("cpu"))}
     fixed["stable_baselines3"] = peer_version() if INSTALLED else ""
     return [fixed | {"seeds": seeds} | summary(milliseconds[seeds]) for seeds in options.seeds]
 
@@ -269,15 +263,15 @@ def save(table: Table, folder: Path) -> None:
 
 def parse_arguments(arguments: Sequence[str]) -> Options:
     """Raises ConfigError for what is wrong."""
-    options = parse_options(arguments, DEFAULTS)
-    steps = positive("steps", options["steps"])
+    options = DEFAULTS | parse_words(arguments, DEFAULTS)
+    steps = whole_number("steps", options["steps"])
     if steps % 2:
         raise ConfigError(f"bad value {steps} for steps: expected an even number, as TD3's actor learns every second")
     return Options(
         split_names("base", options["base"], ALGO),
-        list(dict.fromkeys(positives("seeds", options["seeds"]))),
-        list(dict.fromkeys(positives("threads", options["threads"]))),
-        positive("rounds", options["rounds"]),
+        list(dict.fromkeys(whole_numbers("seeds", options["seeds"]))),
+        list(dict.fromkeys(whole_numbers("threads", options["threads"]))),
+        whole_number("rounds", options["rounds"]),
         steps,
         Path(options["out"]).expanduser(),
     )
@@ -290,7 +284,7 @@ def measure_all(options: Options) -> None:
     total = len(options.bases) * len(options.threads) * len(options.seeds) * (options.rounds + 1)
     with tqdm(total=total, unit="turn", smoothing=0, disable=None) as bar:
         for base in options.bases:
-            peer = Peer(base, paper_config(base), TRANSITIONS) if INSTALLED else None
+            peer = Peer(base, make_config(ALGO[base]), TRANSITIONS) if INSTALLED else None
             cells = {seeds: turns(base, seeds, options.steps, peer) for seeds in options.seeds}
             for threads in options.threads:
                 records += measure(base, threads, options, cells, bar)

@@ -1,25 +1,21 @@
-"""Settings: the dataclass of those that every algorithm has, how a field is declared, and the parsing of `key=value`.
+"""Settings: the dataclass of those that every algorithm has, how a field is declared, and the parsing of values.
 
 An algorithm adds its own settings in a subclass of `Config` beside it, and a map in its own fields (`core.maps.Map`).
 """
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-
-class ConfigError(ValueError):
-    """A setting that the user can put right; its message is one line that names the value and the choices."""
-
+from core.words import ConfigError
 
 # ---------------------------------------------------------------- how a setting is declared
 
@@ -117,48 +113,7 @@ RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "device", "threads", 
 """Settings that do not make a run another experiment: they never show in a run's name."""
 
 
-# ---------------------------------------------------------------- names and seeds on the command line
-
-
-def choose(kind: str, value: str, choices: Iterable[str]) -> str:
-    """`value` if it is one of `choices`, else a ConfigError that names them and the closest one."""
-    choices = list(choices)
-    if value in choices:
-        return value
-    by_folded = {choice.casefold(): choice for choice in choices}
-    close = difflib.get_close_matches(value.casefold(), by_folded, n=1, cutoff=0.6)
-    hint = f"; did you mean {by_folded[close[0]]}?" if close else ""
-    raise ConfigError(f"unknown {kind} {value!r}{hint} (choices: {', '.join(choices)})")
-
-
-def parse_arguments(arguments: Iterable[str], keys: Iterable[str]) -> dict[str, str]:
-    """`key=value` words as a dict. Raises ConfigError for a word of another form, an unknown key or one given twice."""
-    overrides: dict[str, str] = {}
-    for word in arguments:
-        key, equals, value = word.partition("=")
-        if not equals or not value:
-            raise ConfigError(f"expected key=value, got {word!r}")
-        choose("key", key, keys)
-        if key in overrides:
-            raise ConfigError(f"key {key!r} given twice: {overrides[key]!r} and {value!r}")
-        overrides[key] = value
-    return overrides
-
-
-def split_names(
-    kind: str, value: str, choices: Iterable[str], groups: Mapping[str, Iterable[str]] | None = None
-) -> list[str]:
-    """The names of a comma list, each once, in the order given. ConfigError names a wrong one.
-
-    A word of `groups` stands for its names, and `all` for all `choices`.
-    """
-    choices = list(choices)
-    words = {"all": choices, **(groups or {})}
-    names: dict[str, None] = {}
-    for word in value.split(","):
-        choose(kind, word, [*choices, *words])
-        names |= dict.fromkeys(words.get(word, [word]))
-    return list(names)
+# ---------------------------------------------------------------- values on the command line
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
@@ -175,9 +130,6 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             raise ConfigError(f"bad seed {text!r}: at most 1000 seeds a range, each below 2^31")
         seeds.update(range(low, high + 1))
     return tuple(sorted(seeds))
-
-
-# ---------------------------------------------------------------- overrides
 
 
 def override(config: DictConfig, schema: type, key: str, text: str, prefix: str = "") -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from core.agent import Agent
 from core.config import ConfigError
 from core.evaluation import Evaluator
-from core.progress import Stopwatch
+from core.progress import PhaseTimer
 from core.replay import Replay
 from core.seed import Seed
 from store.checkpoint import Checkpoint
@@ -27,9 +27,9 @@ STATE_FORMAT = 2
 class Moments:
     """Writes and restores everything that the future of `seeds` depends on."""
 
-    def __init__(self, seeds: Sequence[Seed], agent: Agent, replay: Replay, evaluator: Evaluator, stopwatch: Stopwatch):
+    def __init__(self, seeds: Sequence[Seed], agent: Agent, replay: Replay, evaluator: Evaluator, timer: PhaseTimer):
         self.seeds, self.agent, self.replay = seeds, agent, replay
-        self.evaluator, self.stopwatch = evaluator, stopwatch
+        self.evaluator, self.timer = evaluator, timer
 
     def write(self, obs: Tensor, center: Tensor | None) -> None:
         """Write a checkpoint of every seed; obs (seeds, n) and `center` (seeds, d) are the present ones.
@@ -74,7 +74,7 @@ class Moments:
             self.replay.streams.generators[i].set_state(state["sampling"])
             checkpoint.fill(*self._stored(seed))
             seed.checkpoints.resume(checkpoint)
-        self.stopwatch.restore(states[-1]["seconds"])
+        self.timer.restore(states[-1]["seconds"])
 
     def _state(self, seed: Seed, obs: Tensor, center: Tensor | None) -> dict[str, Any]:
         """Everything about a seed but its transitions."""
@@ -87,7 +87,7 @@ class Moments:
             "evaluator": self.evaluator.get_state(i),
             "added": self.replay.added[i],
             "sampling": self.replay.streams.generators[i].get_state(),
-            "seconds": self.stopwatch.seconds,
+            "seconds": self.timer.seconds,
         }
 
     def _stored(self, seed: Seed) -> tuple[Callable[[int, int], list[Tensor]], int]:

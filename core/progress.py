@@ -12,32 +12,31 @@ from tqdm import tqdm
 from core.config import Config
 
 
-class Stopwatch:
+class PhaseTimer:
     """Seconds of a training, in all and by phase. The time between a stop and the resumption does not count."""
 
     def __init__(self, phases: Sequence[str]):
-        self.clock = time.perf_counter
         self.phases = dict.fromkeys(phases, 0.0)
-        self.started = self.clock()
+        self.started = time.perf_counter()
 
     @contextmanager
     def timed(self, phase: str) -> Iterator[None]:
         """Count the time of the block for `phase`."""
-        start = self.clock()
+        start = time.perf_counter()
         try:
             yield
         finally:
-            self.phases[phase] += self.clock() - start
+            self.phases[phase] += time.perf_counter() - start
 
     @property
     def seconds(self) -> dict[str, float]:
         """Seconds of each phase, and in "total" those since the start."""
-        return self.phases | {"total": self.clock() - self.started}
+        return self.phases | {"total": time.perf_counter() - self.started}
 
     def restore(self, seconds: dict[str, float]) -> None:
         """Go on from what `seconds` was."""
         self.phases = {phase: seconds[phase] for phase in self.phases}
-        self.started = self.clock() - seconds["total"]
+        self.started = time.perf_counter() - seconds["total"]
 
 
 class Progress:

@@ -19,7 +19,7 @@ from core.config import Config
 from core.cuda_graph import GradientSteps
 from core.evaluation import Evaluator
 from core.moments import Moments
-from core.progress import Progress, Stopwatch
+from core.progress import PhaseTimer, Progress
 from core.random import stream_seed
 from core.replay import Batch, Replay
 from core.seed import Best, Seed
@@ -63,8 +63,8 @@ class Trainer:
         self.center = torch.zeros(len(self.seeds), agent.action_dim) if agent.stores_centers else None
         self.began = False
         self.steps_at_checkpoint = 0  # of all seeds together
-        self.stopwatch = Stopwatch(("environment", "acting", "update", "evaluation", "checkpoint"))
-        self.moments = Moments(self.seeds, agent, self.replay, self.evaluator, self.stopwatch)
+        self.timer = PhaseTimer(("environment", "acting", "update", "evaluation", "checkpoint"))
+        self.moments = Moments(self.seeds, agent, self.replay, self.evaluator, self.timer)
         self.show_progress = progress
 
     def run(self) -> list[dict | None]:
@@ -131,7 +131,7 @@ class Trainer:
 
     def _update(self, live: Sequence[Seed]) -> None:
         """One gradient step. All seeds that have not ended owe some."""
-        with self.stopwatch.timed("update"):
+        with self.timer.timed("update"):
             self.take_gradient_step()
             for seed in live:
                 seed.owed -= 1
@@ -148,13 +148,13 @@ class Trainer:
     def _step(self, seeds: Sequence[Seed]) -> None:
         """One environment step of `seeds`."""
         starts = self.config.learning_starts
-        with self.stopwatch.timed("acting"):
+        with self.timer.timed("acting"):
             warming_up = [seed.position for seed in seeds if seed.steps < starts]
             exploring = [seed.position for seed in seeds if seed.steps >= starts]
             action = self.agent.act(self.obs, self.center, warming_up, exploring)
         arrived, reset_obs = self.obs.numpy().copy(), {}
         reward, terminated, ended = (np.zeros((len(self.seeds), 1), dtype=np.float32) for _ in range(3))
-        with self.stopwatch.timed("environment"):
+        with self.timer.timed("environment"):
             stepped = []
             for seed, outcome in self._outcomes(seeds, action.executed.numpy(), action.stored.numpy()):
                 i = seed.position
@@ -171,7 +171,7 @@ class Trainer:
             return
 
         next_obs = _tensor(arrived)
-        with self.stopwatch.timed("acting"):
+        with self.timer.timed("acting"):
             next_center = self.agent.centers(next_obs)
         ends = _tensor(terminated)
         transitions = Batch(self.obs, action.stored, _tensor(reward), ends, next_obs, self.center, next_center)
@@ -212,7 +212,7 @@ class Trainer:
         if not seeds:
             return
         which = [seed.position for seed in seeds]
-        with self.stopwatch.timed("evaluation"):
+        with self.timer.timed("evaluation"):
             returns = self.evaluator.run(self._policy(which), which, self.config.eval_episodes)
         statistics = self.agent.statistics()
         for seed, seed_returns in zip(seeds, returns, strict=True):
@@ -221,7 +221,7 @@ class Trainer:
                 self._fail(seed, f"evaluation: {self.evaluator.refused[i]}")
                 continue
             seed.evaluated = seed.steps
-            seed.writer.append_evaluation(seed.steps, seed_returns, self.stopwatch.seconds["total"])
+            seed.writer.append_evaluation(seed.steps, seed_returns, self.timer.seconds["total"])
             if statistics and seed.gradient_steps:
                 measures = {name: float(values[i]) for name, values in statistics.items()}
                 seed.writer.append_statistics(seed.steps, measures)
@@ -248,7 +248,7 @@ class Trainer:
             for i in which:
                 self.agent.load_state(i, last[i])
         self.progress.show_final_evaluation()
-        with self.stopwatch.timed("evaluation"):
+        with self.timer.timed("evaluation"):
             returns = self.evaluator.run(policy, which, self.config.final_episodes)
         for seed, seed_returns in zip(seeds, returns, strict=True):
             if seed.position in self.evaluator.refused:
@@ -270,7 +270,7 @@ class Trainer:
             "executed_actions": sum(env.executed_actions for env in envs),
             # (no number before the first action: JSON has no infinity)
             "largest_violation": max((env.largest_violation for env in envs if env.executed_actions), default=None),
-            "seconds": self.stopwatch.seconds,
+            "seconds": self.timer.seconds,
         }
 
     def _fail_if_infinite(self, seed: Seed) -> bool:
@@ -312,7 +312,7 @@ class Trainer:
     def _checkpoint(self) -> None:
         """Write a checkpoint of every seed."""
         self.steps_at_checkpoint = self._all_steps()
-        with self.stopwatch.timed("checkpoint"):
+        with self.timer.timed("checkpoint"):
             for seed in self.seeds:
                 if not seed.ended:
                     self._fail_if_infinite(seed)

@@ -1,6 +1,5 @@
 """The Gymnasium environment of a task: a robot that executes feasible actions only."""
 
-import difflib
 import json
 import math
 
@@ -8,6 +7,7 @@ import gymnasium
 import numpy as np
 import torch
 
+from core.words import known_name
 from envs.tasks import TASKS
 
 TOLERANCE = 1e-6  # largest violation an executed action may have, in the units of `Constraint.violation`
@@ -19,11 +19,7 @@ class InfeasibleActionError(ValueError):
 
 def find_task(name):
     """The `Task` called `name`; ValueError with the choices and the closest name where there is none."""
-    if name in TASKS:
-        return TASKS[name]
-    close = difflib.get_close_matches(str(name).upper(), TASKS, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    raise ValueError(f"unknown task {name!r}{hint} (choices: {' '.join(TASKS)})")
+    return TASKS[known_name("task", name, TASKS)]
 
 
 def step_together(envs, actions):

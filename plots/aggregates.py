@@ -26,7 +26,7 @@ from plots.statistics import (
     probability_of_improvement,
 )
 from plots.style import color_of, line_of, plain, save
-from plots.tables import MISSING, Cell, Table, text_cells
+from tables import MISSING, Table, TableCell, text_cells
 
 INTERVAL = f"{100 * CONFIDENCE:.0f} % interval"
 
@@ -63,7 +63,7 @@ def mean_table(aggregates: Sequence[Aggregates]) -> Table:
     sections, records = [], []
     for aggregate in aggregates:
         for tasks, algos in comparable(aggregate.scores).items():
-            rows: list[list[Cell]] = []
+            rows: list[list[TableCell]] = []
             for algo in algos:
                 runs = sum(len(values) for values in aggregate.scores[algo].values())
                 value, low, high = (float(x) for x in aggregate.means[algo])
@@ -83,16 +83,16 @@ def improvement_table(aggregates: Sequence[Aggregates]) -> Table:
     algos = order_algos({algo for aggregate in aggregates for algo in aggregate.scores})
     sections, records = [], []
     for aggregate in aggregates:
-        rows: list[list[Cell]] = []
+        rows: list[list[TableCell]] = []
         for first in aggregate.scores:
             cells = text_cells("" if rows else aggregate.settings, first)
             for second in algos:
                 estimate = aggregate.improvements.get((first, second))
                 if estimate is None:
-                    cells.append(Cell((MISSING,), missing=True))
+                    cells.append(TableCell((MISSING,), missing=True))
                     continue
                 value, low, high = (float(x) for x in estimate)
-                cells.append(Cell((f"{value:.2f}",), bold=low > 0.5))
+                cells.append(TableCell((f"{value:.2f}",), bold=low > 0.5))
                 tasks = len(aggregate.scores[first].keys() & aggregate.scores[second].keys())
                 record: dict[str, Any] = {"settings": aggregate.settings, "algo": first, "over": second}
                 records.append(record | {"tasks": tasks, "probability": value, "low": low, "high": high})

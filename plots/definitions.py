@@ -9,14 +9,14 @@ from typing import Any
 from algos import ALGORITHMS, setting_keys
 from core.config import RUN_KEYS, keys_of
 from envs.tasks import TASKS, Task
-from plots.tables import MISSING, Cell, Table, text_cells
+from tables import MISSING, Table, TableCell, text_cells
 
 
 def task_table(tasks: Mapping[str, Task] = TASKS) -> Table:
     """The paper's Table "Experiment environments and constraints", with the steps of training."""
     sections, records = [], []
     for robot, names in groupby(tasks, lambda name: tasks[name].robot.__name__):
-        rows: list[list[Cell]] = []
+        rows: list[list[TableCell]] = []
         for name in names:
             task = tasks[name]
             dim = task.constraint.dim
@@ -35,8 +35,8 @@ def hyperparameter_table() -> Table:
     columns = _configurations()
     tables = [algorithm.agent.paper for algorithm in ALGORITHMS.values()]
     in_paper = {key for table in tables for settings in table.values() for key in settings}
-    published: list[list[Cell]] = []
-    further: list[list[Cell]] = []
+    published: list[list[TableCell]] = []
+    further: list[list[TableCell]] = []
     records = []
     for key, setting in setting_keys().items():
         values = [config.get(key) for config in columns.values()]

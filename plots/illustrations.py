@@ -17,8 +17,8 @@ from torch import Tensor
 import envs
 from algos import ALGORITHMS, saved_config
 from constraints import Constraint, LinearConstraint
-from core.config import ConfigError
 from core.random import stream_seed
+from core.words import ConfigError
 from plots.paper import order_tasks
 from plots.style import plain, save
 from store.folder import Run, find_runs, read_run

@@ -18,7 +18,7 @@ from plots.paper import (
     order_algos,
     read_paper,
 )
-from plots.tables import MISSING, Cell, Table, text_cells
+from tables import MISSING, Table, TableCell, text_cells
 
 
 def best_three(means: dict[str, float]) -> set[str]:
@@ -43,19 +43,19 @@ def reward_table(groups: Groups) -> Table:
             row = statistics[condition]
             digits = decimals(stat.mean for stat in row.values())
             best = best_three({algo: stat.mean for algo, stat in row.items()})
-            cells = [Cell(tuple(condition.label.split(", ")))]
+            cells = [TableCell(tuple(condition.label.split(", ")))]
             for algo in algos:
                 same = SAME_WITHOUT_CONSTRAINT.get(algo) if condition.task == UNCONSTRAINED else None
                 if algo in row:
                     failed = count_failed(groups[condition][algo])
                     lines = _lines(row[algo], digits) + ((f"{failed} failed",) if failed else ())
-                    cells.append(Cell(lines, algo in best))
+                    cells.append(TableCell(lines, algo in best))
                     record = condition._asdict() | {"algo": algo} | row[algo]._asdict()
                     records.append(record | {"failed": failed, "best_three": int(algo in best)})
                 elif same in row:
-                    cells.append(Cell(("Same as", same), missing=True, merge=True))
+                    cells.append(TableCell(("Same as", same), missing=True, merge=True))
                 else:
-                    cells.append(Cell((MISSING,), missing=True))
+                    cells.append(TableCell((MISSING,), missing=True))
             rows.append(cells)
         sections.append(rows)
     title = "Rewards: mean ± standard error over seeds (n where not ten), best three of a row bold"

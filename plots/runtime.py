@@ -10,11 +10,11 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from core.config import ConfigError
+from core.words import ConfigError
 from plots.grouping import statistic
 from plots.paper import Statistic, order_algos
 from plots.style import color_of, plain, save
-from plots.tables import MISSING, Table, text_cells
+from tables import MISSING, Table, text_cells
 
 COLUMNS = ("task", "algo", "batch", "trial", "seeds", "steps", "machine", "cpu_seconds", "gpu_seconds")
 FIXED = ("task", "seeds", "steps", "machine")

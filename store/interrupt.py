@@ -1,4 +1,4 @@
-"""Signals that ask for the end, as a question of the training loop, so that it stops where a checkpoint is possible."""
+"""Turns SIGINT, SIGTERM, SIGUSR1 and SIGUSR2 into an exception at the next safe point of the training loop."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
-"""Ctrl-C, `kill`, and what batch systems can be told to send before a job's time is over."""
+"""Ctrl-C, `kill`, and the signals that batch systems can send before a job's time limit."""
 
 
 class Interrupted(Exception):
@@ -19,10 +19,10 @@ class Interrupted(Exception):
 
 
 class Interrupts:
-    """While this context is open, the first of SIGNALS is only noted, for `check` to raise.
+    """While this context is open, the first of SIGNALS is only noted; `stop_if_asked` then raises Interrupted.
 
-    A second one does what it always did: it ends the process at once. In a thread other than the main one, where
-    Python allows no handlers, signals are not touched.
+    A second signal has its usual effect: it ends the process at once. In a thread other than the main one, where
+    Python allows no handlers, signals keep their usual effect.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class Interrupts:
     def __enter__(self) -> Interrupts:
         if threading.current_thread() is threading.main_thread():
             for signum in SIGNALS:
-                # Started in the background of a script, a process may have been told to ignore SIGINT.
+                # A process that a script starts in the background may have to ignore SIGINT.
                 if signal.getsignal(signum) is not signal.SIG_IGN:
                     self._previous[signum] = signal.signal(signum, self._note)
         return self
@@ -46,7 +46,7 @@ class Interrupts:
         self.signum = signum
         self.__exit__()
 
-    def check(self) -> None:
+    def stop_if_asked(self) -> None:
         """Raise Interrupted if a signal came."""
         if self.signum is not None:
             raise Interrupted(self.signum)

@@ -1,4 +1,4 @@
-"""What Slurm says: of the job that this process belongs to, and of the jobs in its queue."""
+"""Questions to Slurm: the job that this process belongs to, and the jobs in the queue."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ ENDED = {
     "BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "PREEMPTED", "REVOKED",
     "TIMEOUT",
 }  # fmt: skip
-"""The states of jobs that are over."""
+"""The states of jobs that have ended."""
 
 
 def cluster() -> str:
-    """The name of the cluster that Slurm's programs ask here; empty where that cannot be told."""
-    # The first one redirects the programs; the second one Slurm sets on its nodes.
+    """The name of the cluster that Slurm's programs ask here; empty if it is unknown."""
+    # The first variable redirects Slurm's programs; Slurm sets the second one on its nodes.
     if name := os.environ.get("SLURM_CLUSTERS") or os.environ.get("SLURM_CLUSTER_NAME"):
         return name
     try:
@@ -31,14 +31,14 @@ def cluster() -> str:
 def current_job() -> dict[str, Any] | None:
     """Cluster, id and number of restarts of the job that this process belongs to; None outside of Slurm.
 
-    The id of one in an array is `<id>_<task>`; it stays when Slurm starts the job again.
+    A job of an array has the id `<id>_<task>`. Slurm keeps the id when it restarts a job.
     """
     if "SLURM_JOB_ID" not in os.environ:
         return None
     job, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
     return {
         "cluster": os.environ.get("SLURM_CLUSTER_NAME", ""),
-        # The number of a job in an array may be that of the whole array.
+        # In an array, SLURM_JOB_ID may be the number of the whole array.
         "id": f"{job}_{task}" if job else os.environ["SLURM_JOB_ID"],
         "restarts": int(os.environ.get("SLURM_RESTART_COUNT", 0)),
     }
@@ -47,32 +47,32 @@ def current_job() -> dict[str, Any] | None:
 def queue(jobs: Iterable[str], timeout: float = 60.0) -> dict[str, str] | None:
     """The state (PENDING, RUNNING, ...) of those of `jobs` that have not ended, by id, an array's as `<id>_<task>`.
 
-    None where Slurm cannot be asked, or does not answer within `timeout` seconds.
+    None if Slurm cannot be asked or does not answer within `timeout` seconds.
     """
     jobs = set(jobs)
     arrays = sorted({job.partition("_")[0] for job in jobs})
     if not arrays:
         return {}
-    # Of all states, as without that it leaves some out in which a job goes on later.
+    # Without --states=all, squeue leaves out some states from which a job continues later.
     command = ["squeue", "--noheader", "--array", "--states=all", "--format=%i %T", f"--jobs={','.join(arrays)}"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout)
     except (OSError, subprocess.TimeoutExpired):
         return None
     if done.returncode:
-        return {} if "Invalid job id" in done.stderr else None  # it forgets jobs some minutes after their end
+        return {} if "Invalid job id" in done.stderr else None  # Slurm forgets jobs some minutes after their end
     states = dict(line.split() for line in done.stdout.splitlines())
     return {job: states[job] for job in jobs & states.keys() if states[job] not in ENDED}
 
 
 def has_ended(job: dict[str, Any]) -> bool:
-    """Whether the incarnation of a job that `current_job` described in it is over for certain.
+    """Whether this run of `job`, as `current_job` described it, has certainly ended.
 
-    Of a job of another cluster than the one that is asked here, nobody can say that.
+    Always False for jobs of another cluster: only the job's own cluster can confirm it.
     """
     here = current_job()
     if here and (here["cluster"], here["id"]) == (job["cluster"], job["id"]):
-        return here["restarts"] > job["restarts"]  # Slurm starts a job again when the one before is gone
+        return here["restarts"] > job["restarts"]  # Slurm restarts a job after its previous run has ended
     if not job["cluster"] or job["cluster"] != cluster():
         return False
     queued = queue([job["id"]])

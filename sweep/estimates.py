@@ -1,7 +1,7 @@
-"""What a cell takes, before it is trained: seconds and memory.
+"""Estimates of a cell's time and memory, before it is trained.
 
-The rates are measured, by `bench/rates.py`, which writes them to sweep/rates.csv: each cell of the table, ten seeds in
-lockstep, one core. Where the folder of results has runs that are finished, the times that those took correct them.
+`bench/rates.py` measures the rates of every cell of the paper's table, ten seeds in lockstep on one core, and writes
+them to sweep/rates.csv. The times of finished runs in the folder of results correct the estimates.
 """
 
 from __future__ import annotations
@@ -14,26 +14,30 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from algos import ALGORITHMS
+from algos import ALGORITHMS, saved_config
 from core.config import Config
 from envs import TASKS
 from store.folder import Run
+from sweep.cells import paper_config
 
 RATES = Path(__file__).with_name("rates.csv")
 COLUMNS = ("task", "algo", "update_ms", "step_ms")
 SEEDS = 10
 """Seeds in lockstep when the rates were measured."""
 
-# Overheads that do not grow with the batch, or with the seeds, in units of them. The batch: fitted to gradient steps of
-# 100 and 256 transitions. The seeds: to cells of one and of ten.
+# Overheads that grow neither with the batch nor with the seeds, in units of those. That of the batch is fitted to
+# gradient steps of 100 and 256 transitions, those of the seeds to cells of one and of ten.
 BATCH_OVERHEAD = 90
 UPDATE_OVERHEAD = 0.5
 STEP_OVERHEAD = 2.0
 
-# Memory, measured as the peaks of short runs with one seed and with ten.
+# Memory: the peaks of short runs with one seed and with ten.
 PROCESS_BYTES = 380e6  # libraries
 SEED_BYTES = 15e6  # networks and optimisers of one seed
 SIMULATOR_BYTES = {"Reacher": 35e6}  # PyBullet's; MuJoCo's are too small to matter
+
+TELLING_STEPS = 10_000
+"""The fewest gradient steps of a run whose time corrects the estimates."""
 
 
 class Rate(NamedTuple):
@@ -52,69 +56,65 @@ def _rates() -> dict[tuple[str, str], Rate]:
 
 @cache
 def _rate(task: str, algo: str) -> Rate:
-    """The measured rate of this cell. For an unknown cell: the mean over those with the same robot and family."""
+    """The measured rate of a cell. Without one: the mean over cells of the same robot and family of algorithms."""
     if (task, algo) in _rates():
         return _rates()[task, algo]
-
-    families = {name: algorithm.agent.family for name, algorithm in ALGORITHMS.items()}
-
-    def alike(other_task: str, other_algo: str) -> bool:
-        return TASKS[other_task].robot == TASKS[task].robot and families[other_algo] == families[algo]
-
-    near = [rate for key, rate in _rates().items() if alike(*key)] or list(_rates().values())
-    return Rate(*map(statistics.mean, zip(*near, strict=True)))
+    family = ALGORITHMS[algo].agent.family
+    same_robot = {key: rate for key, rate in _rates().items() if TASKS[key[0]].robot == TASKS[task].robot}
+    near = [rate for key, rate in same_robot.items() if ALGORITHMS[key[1]].agent.family == family]
+    return Rate(*map(statistics.mean, zip(*(near or same_robot.values() or _rates().values()), strict=True)))
 
 
-def seconds(config: Config, base: Config, seeds: int, start: int = 0) -> float:
-    """What is left of the training of `seeds` seeds from step `start` on, on one core; `base` is the paper's cell."""
-    rate = _rate(config.env, config.algo)
-    robot: Any = TASKS[config.env].robot
+def seconds(config: Config, seeds: int, start: int = 0) -> float:
+    """Time of training `seeds` seeds in lockstep from step `start` to the end, on one core."""
+    rate, robot = _rate(config.env, config.algo), _robot(config)
     step = 1e-3 * rate.step_ms * (seeds + STEP_OVERHEAD) / (SEEDS + STEP_OVERHEAD)
     update = 1e-3 * rate.update_ms * (seeds + UPDATE_OVERHEAD) / (SEEDS + UPDATE_OVERHEAD)
-    update *= (config.batch_size + BATCH_OVERHEAD) / (base.batch_size + BATCH_OVERHEAD)
+    measured = paper_config(config.algo, config.env).batch_size
+    update *= (config.batch_size + BATCH_OVERHEAD) / (measured + BATCH_OVERHEAD)
     rollout = config.train_freq if isinstance(config.train_freq, int) else robot.max_episode_steps
     per_step = 1.0 if config.gradient_steps == -1 else config.gradient_steps / rollout
     updates = per_step * (config.steps - max(start, config.learning_starts))
     evaluations = config.steps // config.eval_every - start // config.eval_every
     episodes = evaluations * config.eval_episodes + config.final_episodes
-    # The episodes of an evaluation run side by side, but each takes its own steps of the simulator.
+    # The episodes of an evaluation run side by side, but the simulator takes the steps of each.
     return step * (config.steps - start + episodes * robot.max_episode_steps) + update * max(0.0, updates)
 
 
 def memory(config: Config, seeds: int) -> float:
     """Bytes, with the replay buffer as full as it gets."""
-    task, algorithm = TASKS[config.env], ALGORITHMS[config.algo]
-    robot: Any = task.robot
-    centers = 2 if algorithm.map.stores_centers(task.constraint) else 0
+    robot = _robot(config)
+    centers = 2 if ALGORITHMS[config.algo].map.stores_centers(TASKS[config.env].constraint) else 0
     width = 2 * robot.obs_dim + (1 + centers) * robot.action_dim + 2
     simulators = (1 + config.eval_episodes) * SIMULATOR_BYTES.get(robot.__name__, 0.0)
     return PROCESS_BYTES + seeds * (SEED_BYTES + simulators + 4.0 * width * min(config.buffer_size, config.steps))
 
 
-TELLING_STEPS = 10_000
-"""Gradient steps from which on a run's time says something of the rates."""
+def _robot(config: Config) -> Any:
+    return TASKS[config.env].robot
 
 
-def corrections(runs: Iterable[tuple[Run, Config, Config]], device: str) -> dict[tuple[str, str], float]:
-    """By (task, algorithm), how many times as long as estimated finished runs took; ("", "") has the median of all.
+def corrections(runs: Iterable[Run], device: str) -> dict[tuple[str, str], float]:
+    """By (task, algorithm): the time that finished runs took over its estimate. ("", "") has the median of all.
 
-    Each run comes with its configuration and the paper's of the same cell. Left out are those on another kind of
-    `device`, with other layers, or too short to tell, and those whose result does not have its time.
+    Leaves out runs on another kind of `device`, with other layers, too short to tell, or without their time.
     """
     ratios: dict[tuple[str, str], list[float]] = {}
-    for run, config, base in runs:
-        if run.result is None or config.device.partition(":")[0] != device.partition(":")[0]:
+    for run in runs:
+        if run.result is None or run.task not in TASKS or run.algo not in ALGORITHMS:
             continue
         try:
+            config = saved_config(run.config | {"env": run.task, "algo": run.algo})
             took, seeds = float(run.result["seconds"]["total"]), int(run.result["seeds_in_lockstep"])
             steps = int(run.result["gradient_steps"])
         except (KeyError, TypeError, ValueError):
             continue
-        if config.hidden != base.hidden or steps < TELLING_STEPS:
-            continue
-        ratio = took / seconds(config, base, seeds)
-        ratios.setdefault((run.task, run.algo), []).append(ratio)
-        ratios.setdefault(("", ""), []).append(ratio)
+        same_device = config.device.partition(":")[0] == device.partition(":")[0]
+        same_layers = config.hidden == paper_config(run.algo, run.task).hidden
+        if same_device and same_layers and steps >= TELLING_STEPS:
+            ratio = took / seconds(config, seeds)
+            ratios.setdefault((run.task, run.algo), []).append(ratio)
+            ratios.setdefault(("", ""), []).append(ratio)
     return {key: statistics.median(values) for key, values in ratios.items()}
 
 
@@ -124,7 +124,7 @@ def correct(corrections: Mapping[tuple[str, str], float], task: str, algo: str) 
 
 
 def makespan(durations: Sequence[float], jobs: int) -> float:
-    """When the last of `durations` ends, where `jobs` at a time start in this order."""
+    """When the last of `durations` ends, if `jobs` at a time start in this order."""
     ends = [0.0] * jobs
     for duration in durations:
         heapq.heapreplace(ends, ends[0] + duration)

@@ -6,51 +6,43 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from core.config import Config, ConfigError
-from sweep.cells import cell_of, job_states
-from sweep.cluster import submit
+from core.words import ConfigError
+from sweep.cells import Cell
+from sweep.exit import Exit
 from sweep.local import cores, run_queue
 from sweep.plan import describe_plan, make_plan, memory_warning
 from sweep.settings import Sweep
+from sweep.slurm import check_gpus, submit
+from sweep.states import job_states
+from sweep.train import check_device
 
 
-def launch(sweep: Sweep, cells: Sequence[tuple[Config, Config]], threads_given: bool, check: Callable[[], None]) -> int:
-    """Plan the cells, each (configuration, the paper's), and print the plan or carry it out; the exit code.
+def launch(sweep: Sweep, cells: Sequence[Cell], threads_given: bool, stop_if_asked: Callable[[], None]) -> Exit:
+    """Plan the cells, and print the plan or carry it out.
 
-    `check` raises Interrupted after a signal. ConfigError for what the user can put right.
+    `threads_given` says that the user has chosen the threads of a cell; `stop_if_asked` raises Interrupted after a
+    signal. Raises ConfigError for settings that the user can correct.
     """
     on_slurm = sweep.settings.launcher == "slurm"
     jobs = sweep.slurm.parallel if on_slurm else sweep.settings.jobs or 1
     if not threads_given:
         threads = sweep.slurm.cpus if on_slurm else max(1, cores() // jobs)
-        cells = [(replace(config, threads=threads), base) for config, base in cells]
-    if on_slurm and cells[0][0].overwrite:
+        cells = [Cell.of(replace(cell.config, threads=threads)) for cell in cells]
+    settings = cells[0].config  # one command has one device, and overwrites all cells or none
+    if not on_slurm:
+        check_device(settings.device)
+    elif settings.overwrite:
         raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
-    if on_slurm:
-        _check_gpus(sweep, cells[0][0].device)
-    entries = make_plan(cells, job_states(cell_of(*cell) for cell in cells))
+    else:
+        check_gpus(sweep, settings.device)
+    entries = make_plan(cells, job_states(cells))
     if sweep.settings.dry:
         print(describe_plan(entries, jobs))
-        return 0
+        return Exit.DONE
     if on_slurm:
         submit(sweep, cells)
-        check()
-        return 0
+        stop_if_asked()
+        return Exit.DONE
     if warning := memory_warning(entries, jobs):
         print(warning, file=sys.stderr)
-    return run_queue(entries, jobs, check)
-
-
-def _check_gpus(sweep: Sweep, device: str) -> None:
-    """ConfigError where the jobs get GPUs that they do not use, or the other way round."""
-    gpus = sweep.slurm.gpus
-    # sbatch has other parameters that ask for GPUs, and some clusters want those.
-    asked = gpus or any(name.startswith(("gpus", "gres", "tres")) for name in sweep.sbatch)
-    if device != "cpu" and not asked:
-        raise ConfigError(f"device={device} with launcher=slurm needs slurm.gpus= of at least 1")
-    if ":" in device:
-        raise ConfigError(
-            f"device={device} does not go with launcher=slurm: a job sees its own GPUs alone (device=cuda)"
-        )
-    if device == "cpu" and gpus:
-        raise ConfigError(f"slurm.gpus={gpus} needs device=cuda: with device=cpu, the cells would not use them")
+    return run_queue(entries, jobs, stop_if_asked)

@@ -1,4 +1,4 @@
-"""The cells of a sweep on this machine: a process each, as many at a time as wanted, the others in a queue."""
+"""The cells of a sweep on this machine: a queue of processes, one for each cell."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from pathlib import Path
 
 from store.files import one_line
 from store.interrupt import Interrupted
-from sweep.cells import command_words, format_seeds, reason_of
-from sweep.plan import Entry, describe_state
+from sweep.cells import format_seeds
+from sweep.exit import Exit
+from sweep.plan import Entry
 from sweep.progress import Display, End
+from sweep.states import Stage, reason_of
 
 RUN = Path(__file__).parents[1] / "run.py"
 POLL = 0.5
@@ -25,7 +27,7 @@ POLL = 0.5
 
 
 class Queue:
-    """The processes of the cells. A crash of one, or the end of one for lack of memory, leaves the others alone."""
+    """The processes of the cells. If one crashes, even for lack of memory, the others continue."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -33,14 +35,14 @@ class Queue:
         self.processes: dict[Entry, tuple[subprocess.Popen, float]] = {}  # with the time of the start
 
     def running(self) -> dict[Entry, float]:
-        """The cells that have a process, each with the seconds since its start."""
+        """The cells that a process trains, each with the seconds since its start."""
         with self.lock:
             return {entry: time.monotonic() - start for entry, (_, start) in self.processes.items()}
 
     def train(self, entry: Entry) -> End | None:
-        """Run the process of a cell to its end; None where the queue was stopped first."""
+        """Run the process of a cell to its end; None if the queue was stopped first."""
         cell, path = entry.cell, entry.cell.record("log")
-        command = [sys.executable, str(RUN), *command_words(entry.config, entry.base)]
+        command = [sys.executable, str(RUN), *cell.words]
         try:
             with self.lock:
                 if self.stopping:
@@ -48,8 +50,8 @@ class Queue:
                 cell.record("end").unlink(missing_ok=True)
                 with open(path, "a") as log:
                     print(f"+ {' '.join(command)} # {datetime.now():%Y-%m-%d %H:%M:%S}", file=log, flush=True)
-                    # In a session of its own, as a terminal sends Ctrl-C to every process of its session: a cell must
-                    # get one signal, from `stop`, because a second one would end it without a checkpoint.
+                    # A session of its own: a terminal sends Ctrl-C to every process of its session, and the signal of
+                    # `stop` would then be the second one, which ends the process without a checkpoint.
                     process = subprocess.Popen(
                         command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
                     )
@@ -63,30 +65,30 @@ class Queue:
             end = End(code, time.monotonic() - start, reason_of(code, path))
             cell.note_end(code, path)
             return end
-        except OSError as error:  # of the log, or of starting a process
+        except OSError as error:  # from the log, or from starting the process
             return End(1, 0.0, f"{error.filename or 'system'}: {one_line(error)}")
 
     def stop(self) -> None:
-        """Have every process write its checkpoint and end, and start no other; a second call ends them at once."""
+        """Let every process write its checkpoint and end, and start no more. A second call ends them at once."""
         with self.lock:
             self.stopping = True
             for process, _ in self.processes.values():
                 process.terminate()
 
 
-def run_queue(entries: Sequence[Entry], jobs: int, check: Callable[[], None]) -> int:
-    """Train the cells that have not ended, `jobs` at a time in the given order; the exit code.
+def run_queue(entries: Sequence[Entry], jobs: int, stop_if_asked: Callable[[], None]) -> Exit:
+    """Train the cells that have not ended, `jobs` at a time, in the given order.
 
-    Those that another process or a Slurm job has, or may have, are left out.
-    `check` raises Interrupted to end all: the processes write their checkpoints first.
+    Leaves out the cells that another process or a Slurm job trains, or may train. When `stop_if_asked` raises
+    Interrupted, the processes write their checkpoints and end.
     """
-    elsewhere = [entry for entry in entries if entry.state.name in ("running", "queued", "unknown")]
+    elsewhere = [entry for entry in entries if entry.state.stage.taken]
     entries = [entry for entry in entries if entry not in elsewhere]
-    waiting = [entry for entry in entries if entry.state.name != "finished"]
+    waiting = [entry for entry in entries if entry.state.stage is not Stage.FINISHED]
     for entry in waiting:
         log = entry.cell.record("log")
         log.parent.mkdir(parents=True, exist_ok=True)
-        log.touch()  # tells `status` of the cell
+        log.touch()  # `status` finds the cell by it
     queue, display = Queue(), Display(entries, jobs)
     interrupted: Interrupted | None = None
     with ThreadPoolExecutor(jobs) as pool, display:
@@ -101,7 +103,7 @@ def run_queue(entries: Sequence[Entry], jobs: int, check: Callable[[], None]) ->
                 display.show(queue.running())
                 try:
                     if interrupted is None:
-                        check()
+                        stop_if_asked()
                 except Interrupted as error:
                     interrupted = error
                     display.say("interrupted: waiting for checkpoints (a second time ends without them)")
@@ -117,18 +119,22 @@ def run_queue(entries: Sequence[Entry], jobs: int, check: Callable[[], None]) ->
         first = elsewhere[0]
         print(
             f"{len(elsewhere)} left out, as others have them (`run.py status {first.cell.root}` shows all):"
-            f" {first.cell.name} seed={format_seeds(first.cell.seeds)} is {describe_state(first.state)}"
+            f" {first.cell.name} seed={format_seeds(first.cell.seeds)} is {first.state.describe()}"
             + (" ..." if len(elsewhere) > 1 else ""),
             file=sys.stderr,
         )
     if interrupted:
         print("interrupted; the same command resumes (without overwrite=true)", file=sys.stderr)
         raise interrupted
-    return 4 if display.failed else 2 if elsewhere else 3 if display.diverged else 0
+    if display.failed:
+        return Exit.FAILED
+    if elsewhere:
+        return Exit.BAD_INPUT
+    return Exit.DIVERGED if display.diverged else Exit.DONE
 
 
 def cores() -> int:
-    """Those that this process may use."""
+    """The number of CPU cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""What a person sees of a sweep on this machine: bars on a terminal, few lines in a file."""
+"""The progress of a sweep on this machine: bars on a terminal, few lines in a file."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from sweep.estimates import in_words, makespan
+from sweep.exit import Exit
 from sweep.plan import Entry
+from sweep.states import Stage
 
 BAR = "{desc} {percentage:3.0f}%|{bar}|"
 INTERVALS = (2.0, 60.0)
-"""Seconds between two looks into the run folders: on a terminal, and for the lines in a file."""
+"""Seconds between two looks into the run folders: for a terminal, and for a file."""
 
 
 class End(NamedTuple):
@@ -26,14 +28,14 @@ class End(NamedTuple):
 
 
 class Display:
-    """Cells done, running with their progress, failed, and when all will be done; a bar for all and one a process."""
+    """Shows the cells that are done, running and failed, and the expected end: a bar for all and one a process."""
 
     def __init__(self, entries: Sequence[Entry], jobs: int):
         self.entries, self.jobs = entries, jobs
-        self.done = [entry for entry in entries if entry.state.name == "finished"]
+        self.done = [entry for entry in entries if entry.state.stage is Stage.FINISHED]
         self.diverged = [entry for entry in self.done if entry.state.detail]
         self.failed: dict[Entry, End] = {}
-        self.seconds = self.estimated = 0.0  # of processes that have ended well: what they took, and were to take
+        self.seconds = self.estimated = 0.0  # of processes that ended well: actual time and estimate
         self.terminal = sys.stderr.isatty()
         self.next_look = 0.0 if self.terminal else time.monotonic() + INTERVALS[1]
 
@@ -48,20 +50,20 @@ class Display:
             bar.close()
 
     def say(self, line: str) -> None:
-        """A line that stays."""
+        """Print a line that stays."""
         tqdm.write(line, file=sys.stderr)
 
     def end(self, entry: Entry, end: End) -> None:
         """Count a cell whose process has ended."""
-        if end.code not in (0, 3):
+        if end.code not in (Exit.DONE, Exit.DIVERGED):
             self.failed[entry] = end
             self.say(f"{entry.cell.name}: failed after {in_words(end.seconds)}: {end.reason}")
             return
         self.done.append(entry)
         self.seconds, self.estimated = self.seconds + end.seconds, self.estimated + entry.remaining
-        if end.code == 3:
+        if end.code == Exit.DIVERGED:
             self.diverged.append(entry)
-        how = "finished, a seed diverged" if end.code == 3 else "finished"
+        how = "finished, a seed diverged" if end.code == Exit.DIVERGED else "finished"
         self.say(f"{entry.cell.name}: {how} after {in_words(end.seconds)} ({len(self.done)} of {len(self.entries)})")
 
     def show(self, running: Mapping[Entry, float]) -> None:
@@ -90,7 +92,7 @@ class Display:
         bar.refresh()
 
     def _eta(self, running: Mapping[Entry, float], shares: Mapping[Entry, float]) -> float:
-        """Seconds, at the pace of the processes so far, compared with their estimates."""
+        """Seconds until the end, if the rest runs at the pace of the processes so far, relative to their estimates."""
         left = {entry: entry.seconds(0) * (1.0 - share) for entry, share in shares.items()}
         done = sum(max(0.0, entry.remaining - left[entry]) for entry in running)
         took, estimated = self.seconds + sum(running.values()), self.estimated + done

@@ -1,4 +1,4 @@
-"""The settings of a sweep: how cells are run, not what they learn, so no run's folder has them in its name."""
+"""The settings of a sweep: how cells are run, not what they learn. They are part of no run's name."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from dataclasses import dataclass, field, fields
 from omegaconf import OmegaConf
 
 from algos import setting_keys
-from core.config import ConfigError, choose, override
+from core.config import override
+from core.words import ConfigError, known_name, parse_words
 
 SLURM_PREFIX = "slurm."
 LAUNCHERS = ("local", "slurm")
 SIGNAL_DELAY = 120
-"""Seconds before the time limit at which Slurm tells a job: enough for a checkpoint of many seeds on a slow disk."""
+"""Seconds between Slurm's signal and the time limit: enough for a checkpoint of many seeds on a slow disk."""
 
 
 @dataclass
@@ -51,50 +52,41 @@ class Sweep:
         return self.settings.jobs is not None or self.settings.dry or self.settings.launcher == "slurm"
 
 
-def parse_sweep(arguments: Sequence[str]) -> tuple[Sweep, list[str]]:
-    """The settings of the sweep, and the words that are left: those of the cells.
+def parse_sweep(words: Sequence[str]) -> tuple[Sweep, dict[str, str]]:
+    """The settings of the sweep, and those of its cells.
 
-    ConfigError for an unknown key, one given twice, and a value that does not fit.
+    Raises ConfigError for an unknown key, a key that is given twice, and a value that does not fit.
     """
     own = [f.name for f in fields(SweepSettings)]
     slurm_names = [f.name for f in fields(SlurmSettings)]
     settings, slurm = OmegaConf.structured(SweepSettings), OmegaConf.structured(SlurmSettings)
     sbatch: dict[str, str] = {}
-    words: list[str] = []
-    seen: dict[str, str] = {}
-    for word in arguments:
-        key, equals, value = word.partition("=")
+    cells: dict[str, str] = {}
+    keys = [*setting_keys(), *own, *(SLURM_PREFIX + name for name in slurm_names)]
+    given = parse_words(words, keys, free=SLURM_PREFIX)
+    for key, text in given.items():
         name = key.removeprefix(SLURM_PREFIX)
-        if equals and not key.startswith(SLURM_PREFIX):
-            # Here, where all keys are known, so that a misspelt one is told of all choices.
-            choose("key", key, [*setting_keys(), *own, *(SLURM_PREFIX + n for n in slurm_names)])
-        if key not in own and not key.startswith(SLURM_PREFIX):
-            words.append(word)
-            continue
-        if not equals or not value or not name:
-            raise ConfigError(f"expected key=value, got {word!r}")
-        if key in seen:
-            raise ConfigError(f"key {key!r} given twice: {seen[key]!r} and {value!r}")
-        seen[key] = value
         if key in own:
-            override(settings, SweepSettings, key, value)
+            override(settings, SweepSettings, key, text)
+        elif not key.startswith(SLURM_PREFIX):
+            cells[key] = text
         elif name in slurm_names:
-            override(slurm, SlurmSettings, name, value, SLURM_PREFIX)
+            override(slurm, SlurmSettings, name, text, SLURM_PREFIX)
         else:
-            sbatch[name.replace("_", "-")] = value
+            sbatch[name.replace("_", "-")] = text
     sweep = Sweep(
         typing.cast(SweepSettings, OmegaConf.to_object(settings)),
         typing.cast(SlurmSettings, OmegaConf.to_object(slurm)),
         sbatch,
     )
-    _check(sweep, [key for key in seen if key.startswith(SLURM_PREFIX)])
-    return sweep, words
+    _check_values(sweep, [key for key in given if key.startswith(SLURM_PREFIX)])
+    return sweep, cells
 
 
-def _check(sweep: Sweep, slurm_keys: Sequence[str]) -> None:
+def _check_values(sweep: Sweep, slurm_keys: Sequence[str]) -> None:
     settings, slurm = sweep.settings, sweep.slurm
     if settings.launcher not in LAUNCHERS:
-        choose("launcher", settings.launcher, LAUNCHERS)
+        known_name("launcher", settings.launcher, LAUNCHERS)
     if settings.jobs is not None and settings.jobs < 1:
         raise ConfigError(f"bad value {settings.jobs} for jobs: must be at least 1")
     if settings.jobs is not None and settings.launcher == "slurm":
@@ -107,7 +99,7 @@ def _check(sweep: Sweep, slurm_keys: Sequence[str]) -> None:
     if not 0 < slurm.hours < float("inf"):
         raise ConfigError(f"bad value {slurm.hours} for slurm.hours: must be positive and finite")
     if 3600 * slurm.hours <= 2 * SIGNAL_DELAY and "signal" not in sweep.sbatch:
-        # The signal would come before the training has come anywhere, again and again.
+        # The signal would come before the training has made progress, again and again.
         raise ConfigError(
             f"bad value {slurm.hours} for slurm.hours: must be more than {2 * SIGNAL_DELAY} seconds, as a cell writes"
             f" its checkpoint {SIGNAL_DELAY} seconds before the end, unless slurm.signal= says otherwise"

@@ -1,24 +1,25 @@
-"""How the cells in a folder of results stand: from the run folders, the records of sweeps, and Slurm's queue."""
+"""`run.py status`: how the cells in a folder of results stand."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from core.config import ConfigError, parse_seeds
-from plots.tables import Table, text_cells, to_terminal
+from core.config import parse_seeds
+from core.words import ConfigError
 from store.folder import find_runs, has_ended, read_settings
-from sweep.cells import NO_ANSWER, RECORDS, Cell, State, format_seeds, job_states, reached, shorten, state_of
-from sweep.plan import count_states, describe_state, list_details
+from sweep.cells import RECORDS, CellFolders, format_seeds, shorten
+from sweep.states import NO_ANSWER, CellState, count_states, job_states, list_details, reached, state_of
+from tables import Table, text_cells, to_terminal
 
 
-def find_cells(root: Path) -> list[Cell]:
-    """The cells below `root`: as they were submitted or started by a sweep; runs that no sweep knows by the folder."""
-    cells: dict[Cell, None] = {}
+def find_cells(root: Path) -> list[CellFolders]:
+    """The cells below `root`: those of sweeps by their records, other runs as one cell for each folder of seeds."""
+    cells: dict[CellFolders, None] = {}
     for record in sorted((root / RECORDS).glob("*/*/seed=*.*")):
         if record.suffix in (".log", ".job"):
             seeds = tuple(parse_seeds(record.stem.removeprefix("seed=")))
-            cells[Cell(root, record.parent.parent.name, record.parent.name, seeds)] = None
+            cells[CellFolders(root, record.parent.parent.name, record.parent.name, seeds)] = None
     known = {folder for cell in cells for folder in cell.folders}
     others: dict[tuple[str, str], list[int]] = {}
     for folder in find_runs(root):
@@ -26,12 +27,12 @@ def find_cells(root: Path) -> list[Cell]:
             key = folder.parent.parent.name, folder.parent.name
             others.setdefault(key, []).append(int(folder.name.removeprefix("seed=")))
     for (task, variant), found in others.items():
-        cells[Cell(root, task, variant, tuple(sorted(found)))] = None
+        cells[CellFolders(root, task, variant, tuple(sorted(found)))] = None
     return sorted(cells, key=lambda cell: (cell.task, cell.variant, cell.seeds))
 
 
 def describe_status(words: Sequence[str]) -> str:
-    """The table of `run.py status FOLDER`. ConfigError for another number of folders, or one without any cells."""
+    """The table of `run.py status FOLDER`. Raises ConfigError unless it is one folder with cells."""
     if len(words) != 1:
         raise ConfigError(f"expected one folder of results, as in `run.py status results/`, got {len(words)}")
     root = Path(words[0]).expanduser()
@@ -48,20 +49,20 @@ def describe_status(words: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def _table(cells: Sequence[Cell], states: Sequence[State]) -> str:
+def _table(cells: Sequence[CellFolders], states: Sequence[CellState]) -> str:
     names, shared = shorten(cells)
     rows = [
-        text_cells(cell.task, name, format_seeds(cell.seeds), _progress(cell, state), describe_state(state))
+        text_cells(cell.task, name, format_seeds(cell.seeds), _progress(cell, state), state.describe())
         for cell, name, state in zip(cells, names, states, strict=True)
     ]
-    title = f"Cells{shared and ' (all with '}{shared}{shared and ')'}:"
+    title = f"Cells{shared and f' (all with {shared})'}:"
     header = ["task", "algorithm", "seeds", "steps", "state"]
     table = Table("status", title, header, labels=5, sections=[rows], records=[])
     return to_terminal(table, bold=False, width=None)
 
 
-def _progress(cell: Cell, state: State) -> str:
-    """How far the seeds that have not ended are, of how many steps, and how many have ended."""
+def _progress(cell: CellFolders, state: CellState) -> str:
+    """The steps of the unfinished seed furthest behind, of how many, and how many seeds have ended."""
     left = [folder for folder in cell.folders if not has_ended(folder)]
     if not left:
         return "all"

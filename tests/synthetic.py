@@ -12,11 +12,10 @@ if __name__ == "__main__":
 import numpy as np
 from tqdm import tqdm
 
-from algos import paper_settings
 from core.config import saved_settings
-from envs import TASKS
 from plots.paper import COLORS, DEFAULT_BATCH, FAMILIES, read_paper
 from store.folder import RunWriter, run_folder, variant_name
+from sweep.cells import paper_config
 
 CONDITIONS = list(dict.fromkeys((task, batch) for task, batch, _ in read_paper()))
 
@@ -31,7 +30,7 @@ def write_results(root, conditions=CONDITIONS, algos=tuple(COLORS), seeds=10, ev
         paper = {algo: stat for (name, size, algo), stat in read_paper().items() if (name, size) == (task, batch)}
         mean_of_row = np.mean([stat.mean for stat in paper.values()])
         for algo in algos:
-            config = paper_settings(algo, task, TASKS[task].robot, TASKS[task].steps)
+            config = paper_config(algo, task)
             overrides = {} if batch == DEFAULT_BATCH else {"batch_size": int(batch)}
             for key, value in overrides.items():
                 setattr(config, key, value)
@@ -45,8 +44,11 @@ def write_results(root, conditions=CONDITIONS, algos=tuple(COLORS), seeds=10, ev
                     risen = final * (1 - np.exp(-6 * step / config.steps))
                     writer.append_evaluation(step, risen + spread * rng.normal(size=config.eval_episodes), step / 100)
                     if algo in FAMILIES["SAC family"] and step > config.learning_starts:
-                        temperature = np.exp(-5 * step / config.steps + 0.1 * rng.normal())
-                        writer.append_statistics(step, {"temperature": temperature, "entropy": -2.0})
+                        measures = {
+                            "temperature": np.exp(-5 * step / config.steps + 0.1 * rng.normal()),
+                            "entropy": -2.0,
+                        }
+                        writer.append_statistics(step, measures)
                 writer.finish({"return_mean": final, "returns": final + spread * rng.normal(size=50)})
 
 

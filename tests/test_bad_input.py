@@ -7,8 +7,8 @@ import json
 
 import pytest
 import torch
+from helpers import run_command
 
-import run
 from constraints import (
     Ball,
     Box,
@@ -30,7 +30,7 @@ VARIANT = "DPre,batch_size=4,eval_episodes=1,eval_every=20,final_episodes=1,hidd
 def refused(capsys, words):
     """The only line that the command `words` says."""
     capsys.readouterr()
-    assert run.main(words.split()) == 2
+    assert run_command(words.split()) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("run.py: ") and captured.err.count("\n") == 1, captured.err
     return captured.err
@@ -121,7 +121,7 @@ def test_an_end_that_cannot_be_read_is_not_run_over(capsys, tmp_path, name, cont
     folder = tmp_path / "R+N" / VARIANT / "seed=0"
     folder.mkdir(parents=True)
     (folder / name).write_text(content)
-    run.main(f"algo=DPre env=R+N {WORDS} results={tmp_path}".split())
+    run_command(f"algo=DPre env=R+N {WORDS} results={tmp_path}".split())
     out = capsys.readouterr().out
     assert out.startswith(f"{folder}: already finished, but unreadable ({folder / name}: ") and out.count("\n") == 1
     assert (folder / name).read_text() == content and len(list(folder.iterdir())) == 1
@@ -204,6 +204,6 @@ def test_a_constraint_that_breaks_down_later_says_where(capsys, tmp_path, monkey
 
     calls = []
     monkeypatch.setitem(TASKS, "R+X", Task(Reacher, rows(lambda o: ones(o, 1, 2), bound), "a task", "a formula", 20))
-    assert run.main(f"algo=DPre env=R+X {WORDS} results={tmp_path}".split()) == 2
+    assert run_command(f"algo=DPre env=R+X {WORDS} results={tmp_path}".split()) == 2
     assert capsys.readouterr().err.splitlines()[-1].endswith("the set is empty")
     assert not list(tmp_path.rglob("*.lock"))

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from helpers import cells_of, config_of, run_command
 
-import run
 from algos import ALGORITHMS, PAPER, setting_keys
-from core.config import ConfigError, parse_seeds
+from core.config import parse_seeds
+from core.words import ConfigError
 from envs import TASKS
 from store.folder import read_run
 
@@ -28,7 +29,7 @@ def python(*arguments, **options):
 
 @pytest.mark.parametrize("arguments", [[], ["--help"]])
 def test_usage_names_every_algorithm_task_and_key(capsys, arguments):
-    assert run.main(arguments) == 0
+    assert run_command(arguments) == 0
     out = capsys.readouterr().out
     for name in [*ALGORITHMS, *TASKS, *setting_keys()]:
         assert name in out
@@ -79,7 +80,7 @@ def test_usage_names_every_algorithm_task_and_key(capsys, arguments):
     ],
 )
 def test_wrong_input_gets_one_line_and_exit_code_2(capsys, tmp_path, words, said):
-    assert run.main([*words.split(), f"results={tmp_path}"]) == 2
+    assert run_command([*words.split(), f"results={tmp_path}"]) == 2
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1 and said in captured.err and captured.err.startswith("run.py: ")
     assert not list(tmp_path.iterdir())
@@ -87,14 +88,14 @@ def test_wrong_input_gets_one_line_and_exit_code_2(capsys, tmp_path, words, said
 
 def test_results_folder_that_cannot_be_made(capsys, tmp_path):
     (tmp_path / "file").write_text("")
-    assert run.main(["algo=DPre", "env=R+N", f"results={tmp_path / 'file'}", *SHORT]) == 2
+    assert run_command(["algo=DPre", "env=R+N", f"results={tmp_path / 'file'}", *SHORT]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_numbers_as_people_write_them():
-    ((config, _),) = run.plan(["algo=SRad", "env=W+M", "steps=3e5", "hidden=64,32", "learning_rate=1e-3"])
+    config = config_of(["algo=SRad", "env=W+M", "steps=3e5", "hidden=64,32", "learning_rate=1e-3"])
     assert (config.steps, config.hidden, config.learning_rate) == (300_000, [64, 32], 1e-3)
-    ((config, _),) = run.plan(["algo=SRad", "env=W+M", "steps=010", "hidden=[1e2,32]", "train_freq=08"])
+    config = config_of(["algo=SRad", "env=W+M", "steps=010", "hidden=[1e2,32]", "train_freq=08"])
     assert (config.steps, config.hidden, config.train_freq) == (10, [100, 32], 8)
 
 
@@ -105,19 +106,23 @@ def test_seeds():
         parse_seeds("1;2")
 
 
+def configs(words):
+    return [cell.config for cell in cells_of(words)]
+
+
 def test_lists_and_all_make_the_product():
-    cells = run.plan(["algo=DRad,DPre", "env=all"])
+    cells = cells_of(["algo=DRad,DPre", "env=all"])
     assert len(cells) == 2 * len(TASKS)
     # A key of some algorithms only goes to those.
-    by_name = {config.algo: config for config, _ in run.plan(["algo=all", "env=R+N", "fw_learning_rate=0.5"])}
+    by_name = {config.algo: config for config in configs(["algo=all", "env=R+N", "fw_learning_rate=0.5"])}
     assert by_name["NFW"].fw_learning_rate == 0.5 and not hasattr(by_name["DPre"], "fw_learning_rate")
 
 
 def test_the_papers_hyperparameters():
     """Spot checks of Table "Hyperparameters used in the experiments", through the resolution of cells."""
-    cells = {(c.algo, c.env): c for c, _ in run.plan(["algo=all", "env=all"])}
+    cells = {(c.algo, c.env): c for c in configs(["algo=all", "env=all"])}
     assert len(cells) == 13 * len(ALGORITHMS)
-    assert [c.algo for c, _ in run.plan(["algo=paper", "env=R+N"])] == list(PAPER) and len(PAPER) == 13
+    assert [config.algo for config in configs(["algo=paper", "env=R+N"])] == list(PAPER) and len(PAPER) == 13
     nfw, srad = cells["NFW", "R+L2"], cells["SRad", "R+L2"]
     assert (nfw.gamma, nfw.batch_size, nfw.buffer_size, nfw.fw_learning_rate) == (0.98, 100, 200_000, 0.05)
     assert (nfw.train_freq, nfw.gradient_steps, nfw.steps, nfw.action_noise) == ("episode", -1, 300_000, 0.1)
@@ -189,7 +194,7 @@ def test_interrupted_by_signals_it_resumes_and_a_second_process_keeps_off(tmp_pa
 
     process = start()
     folder = wait_for(evaluations=1)
-    assert run.main(words) == 2
+    assert run_command(words) == 2
     assert f"{folder} is being trained by process {process.pid} on " in capsys.readouterr().err
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)

@@ -6,10 +6,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_resume import Breaks, assert_identical, outcome, train, train_through
+from helpers import Breaks, assert_identical, outcome, run_command, train, train_through
 
 import envs
-import run
 from algos import ALGORITHMS
 from core.random import stream_seed
 from envs import ActionConstrainedEnv
@@ -71,7 +70,7 @@ def test_the_neighbours_of_a_seed_that_diverges_notice_nothing(
     words = f"{cell} {WORDS}"
     train(tmp_path / "sound", words)
     poison(monkeypatch, cell.split()[0].partition("=")[2], spoil(network, value))
-    assert run.main([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
+    assert run_command([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
     (failed,) = failures(tmp_path / "spoiled").items()
     assert failed[0] == "seed=5" and failed[1]["quantity"] == quantity
     assert failed[1]["step"] == 40 + MOMENT and failed[1]["gradient_steps"] == MOMENT
@@ -94,7 +93,7 @@ def test_a_failed_run_is_reported_and_not_run_again_unless_asked(tmp_path, monke
     words = [*f"algo=DPre env=R+N {WORDS}".split(), f"results={tmp_path}"]
     with monkeypatch.context() as patch:
         poison(patch, "DPre", spoil("critic", math.nan))
-        assert run.main(words) == 3
+        assert run_command(words) == 3
     (folder,) = tmp_path.glob("*/*/seed=5")
     said = f"{folder}: failed at step 86: critic loss is not finite"
     assert said in capsys.readouterr().err
@@ -110,9 +109,9 @@ def test_a_failed_run_is_reported_and_not_run_again_unless_asked(tmp_path, monke
     assert torch.load(folder / "last.pt", weights_only=True)["critic.net.layers.0.weight"].isnan().any()
     assert torch.load(folder / "best.pt", weights_only=True)["critic.net.layers.0.weight"].isfinite().all()
 
-    assert run.main(words) == 3
+    assert run_command(words) == 3
     assert capsys.readouterr().out.count("overwrite=true") == 3
-    assert run.main([*words, "overwrite=true"]) == 0
+    assert run_command([*words, "overwrite=true"]) == 0
     assert (folder / "result.json").is_file() and (folder.with_name("seed=5.old-1") / "failed.json").is_file()
     (folder / "failed.json").write_text("{}")
     assert read_results(tmp_path)[1] == [f"{folder / 'failed.json'}: no step or no quantity"]
@@ -138,7 +137,7 @@ def test_all_seeds_may_fail(tmp_path, monkeypatch):
             spoil("critic", math.nan, i)(agent)
 
     poison(monkeypatch, "DPre", how)
-    assert run.main([*f"algo=DPre env=R+N {WORDS}".split(), f"results={tmp_path}"]) == 3
+    assert run_command([*f"algo=DPre env=R+N {WORDS}".split(), f"results={tmp_path}"]) == 3
     assert len(failures(tmp_path)) == 3 and not list(tmp_path.rglob("checkpoint"))
 
 
@@ -147,7 +146,7 @@ def test_a_parameter_that_no_loss_shows_is_found_before_it_is_evaluated(tmp_path
         agent.actor.layers[0].bias.data[BAD, 0, 0] = -math.inf
 
     poison(monkeypatch, "DPre", how, at=79)
-    assert run.main([*f"algo=DPre env=R+N {WORDS}".split(), f"results={tmp_path}"]) == 3
+    assert run_command([*f"algo=DPre env=R+N {WORDS}".split(), f"results={tmp_path}"]) == 3
     ((name, failure),) = failures(tmp_path).items()
     assert name == "seed=5" and failure["quantity"] == "parameter actor.layers.0.bias is not finite"
     assert failure["step"] == 120 and failure["last_evaluation"]["step"] == 60
@@ -164,7 +163,7 @@ def test_an_action_that_is_not_finite(tmp_path, monkeypatch, algo):
         return suggested
 
     monkeypatch.setattr(ALGORITHMS[algo].agent, "explore", spoiled)
-    assert run.main([*f"algo={algo} env=R+L2 {WORDS}".split(), f"results={tmp_path}"]) == 3
+    assert run_command([*f"algo={algo} env=R+L2 {WORDS}".split(), f"results={tmp_path}"]) == 3
     ((name, failure),) = failures(tmp_path).items()
     assert name == "seed=5" and failure["quantity"] == "action [nan, nan] is not finite"
 
@@ -180,7 +179,7 @@ def test_a_seed_that_fails_at_its_first_step(tmp_path, monkeypatch):
     words = f"algo=DPre env=R+N {WORDS}"
     train(tmp_path / "sound", words)
     monkeypatch.setattr(ALGORITHMS["DPre"].agent, "warm_up", spoiled)
-    assert run.main([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
+    assert run_command([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
     ((name, failure),) = failures(tmp_path / "spoiled").items()
     assert name == "seed=5" and (failure["step"], failure["executed_actions"]) == (0, 0)
     assert failure["last_evaluation"] is None and failure["largest_violation"] is None
@@ -199,7 +198,7 @@ def test_a_map_that_gives_an_infeasible_action_ends_the_seed_and_says_by_how_muc
         return executed
 
     monkeypatch.setattr(ALGORITHMS["DPro"].agent, "feasible", spoiled)
-    assert run.main([*f"algo=DPro env=R+L2 {WORDS}".split(), f"results={tmp_path}"]) == 3
+    assert run_command([*f"algo=DPro env=R+L2 {WORDS}".split(), f"results={tmp_path}"]) == 3
     ((name, failure),) = failures(tmp_path).items()
     assert name == "seed=5" and "violates the constraint by 0.48" in failure["quantity"]
 
@@ -222,7 +221,7 @@ def test_an_evaluation_with_a_refused_action(tmp_path, monkeypatch):
     words = f"algo=DRad env=R+L2 {WORDS}"
     train(tmp_path / "sound", words)
     monkeypatch.setattr(agent_class, "policy", spoiled)
-    assert run.main([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
+    assert run_command([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
     ((name, failure),) = failures(tmp_path / "spoiled").items()
     assert name == "seed=5" and failure["quantity"].startswith(
         "evaluation: R+L2, step 1 of the episode: action [nan nan]"
@@ -245,7 +244,7 @@ def test_an_environment_that_breaks_down(tmp_path, monkeypatch, what):
     words = f"algo=DPre env=R+N {WORDS}"
     target = envs.make("R+N").reset(seed=stream_seed(5, "environment"))[0]
     monkeypatch.setattr(ActionConstrainedEnv, "_execute", spoiled)
-    assert run.main([*words.split(), f"results={tmp_path}"]) == 3
+    assert run_command([*words.split(), f"results={tmp_path}"]) == 3
     ((name, failure),) = failures(tmp_path).items()
     assert name == "seed=5" and failure["quantity"] == "observation or reward is not finite" and failure["step"] == 29
     assert failure["last_evaluation"] is None

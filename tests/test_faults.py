@@ -16,14 +16,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_resume import Breaks, assert_identical, outcome, train, train_through
+from helpers import Breaks, assert_identical, outcome, run_command, train, train_through
 
-import run
 from algos.td3 import TD3
 from core.replay import Batch, Replay
 from store import folder as results
 from store.checkpoint import Checkpoint, CheckpointFolder, group_checkpoints
-from store.interrupt import Interrupted
+from store.interrupt import Interrupted, Interrupts
 from store.lock import LockedError, run_lock
 
 ROOT = Path(__file__).parents[1]
@@ -204,10 +203,10 @@ def test_settings_that_changed_are_not_mixed(tmp_path, capsys, monkeypatch):
     folder, _ = break_off(tmp_path)
     monkeypatch.setitem(TD3.paper["Reacher"], "tau", 0.5)
     capsys.readouterr()
-    assert run.main([*WORDS.split(), f"results={tmp_path}"]) == 2
+    assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 2
     err = capsys.readouterr().err
     assert f"{folder} was started with tau=0.005, which is 0.5 now; overwrite=true" in err and err.count("\n") == 1
-    assert run.main([*WORDS.split(), f"results={tmp_path}", "overwrite=true"]) == 0
+    assert run_command([*WORDS.split(), f"results={tmp_path}", "overwrite=true"]) == 0
     assert (folder.parent / "seed=3.old-1" / "checkpoint").is_dir() and (folder / "result.json").is_file()
 
 
@@ -321,7 +320,7 @@ def test_a_result_that_cannot_be_written_ends_the_run_with_one_line_and_it_can_b
     append = results.RunWriter._append
     with monkeypatch.context() as patch:
         patch.setattr(results.RunWriter, "_append", fill_disk)
-        assert run.main([*WORDS.split(), f"results={tmp_path}"]) == 2
+        assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 2
     err = capsys.readouterr().err
     (table,) = [path for path in tmp_path.glob("*/*/seed=?/evaluations.csv") if path.is_symlink()]
     assert err.splitlines()[-1] == f"run.py: {table}: no space left on device" and "Traceback" not in err
@@ -338,14 +337,14 @@ def test_a_run_in_progress_is_left_to_its_process(tmp_path, capsys):
     capsys.readouterr()
     with run_lock(folder):
         before = outcome_files(tmp_path)
-        assert run.main([*WORDS.split(), f"results={tmp_path}"]) == 2
-        assert run.main([*WORDS.split(), f"results={tmp_path}", "overwrite=true"]) == 2
+        assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 2
+        assert run_command([*WORDS.split(), f"results={tmp_path}", "overwrite=true"]) == 2
         err = capsys.readouterr().err
         said = f"run.py: {folder} is being trained by process {os.getpid()} on {socket.gethostname()}\n"
         assert err == 2 * said
         assert outcome_files(tmp_path) == before
     assert not list(tmp_path.rglob("*.lock"))  # the other seed's too
-    assert run.main([*WORDS.split(), f"results={tmp_path}"]) == 0
+    assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 0
 
 
 def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
@@ -411,10 +410,10 @@ def test_a_second_signal_ends_the_process_at_once():
         "import os, signal\n"
         "from store.interrupt import Interrupted, Interrupts\n"
         "with Interrupts() as interrupts:\n"
-        "    interrupts.check()\n"
+        "    interrupts.stop_if_asked()\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
         "    try:\n"
-        "        interrupts.check()\n"
+        "        interrupts.stop_if_asked()\n"
         "    except Interrupted as interrupted:\n"
         "        print('noted', interrupted.signum, flush=True)\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
@@ -430,7 +429,7 @@ def test_handlers_are_put_back_and_an_ignored_signal_stays_ignored():
         "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
         "with Interrupts() as interrupts:\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
-        "    interrupts.check()\n"
+        "    interrupts.stop_if_asked()\n"
         "print(signal.getsignal(signal.SIGTERM) == signal.SIG_DFL, signal.getsignal(signal.SIGINT) == signal.SIG_IGN)\n"
     )
     assert done.returncode == 0 and done.stdout.split() == ["True", "True"], done.stderr
@@ -439,12 +438,12 @@ def test_handlers_are_put_back_and_an_ignored_signal_stays_ignored():
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_the_exit_code_says_which_signal(tmp_path, capsys, monkeypatch, signum, unbroken):
     check = Breaks(77, error=Interrupted(signum))
-    monkeypatch.setattr(run.Interrupts, "check", lambda self: check())
+    monkeypatch.setattr(Interrupts, "stop_if_asked", lambda self: check())
     words = [*WORDS.split(), f"results={tmp_path}"]
-    assert run.main(words) == 128 + signum
+    assert run_command(words) == 128 + signum
     captured = capsys.readouterr()
     assert "interrupted at step" in captured.err and "the same command resumes" in captured.err
-    assert run.main(words) == 0
+    assert run_command(words) == 0
     assert capsys.readouterr().out.count("resuming from step") == 2
     assert_identical(outcome(tmp_path), unbroken)
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers import cells_of, config_of, run_command
 
 import core.cuda_graph
 import envs
-import run
 from algos import ALGORITHMS
 from constraints import LinearConstraint
 from core.cuda_graph import EAGER_STEPS, GradientSteps
@@ -20,6 +20,7 @@ from core.random import Tape
 from core.replay import Batch, Replay
 from store.folder import read_run
 from store.interrupt import Interrupted
+from sweep.train import train as train_cell
 
 SEEDS = [3, 8]
 BATCH = 16
@@ -29,7 +30,7 @@ needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a C
 
 def make(name, task="W+M", device="cpu"):
     """An agent with small networks and a replay buffer with random transitions that keeps growing."""
-    ((config, _),) = run.plan([f"algo={name}", f"env={task}", "hidden=[16,16]", f"batch_size={BATCH}"])
+    config = config_of([f"algo={name}", f"env={task}", "hidden=[16,16]", f"batch_size={BATCH}"])
     constraint, robot = envs.constraint(task), envs.TASKS[task].robot
     agent = ALGORITHMS[name].build(replace(config, device=device), constraint, robot.obs_dim, SEEDS)
     replay = Replay(SEEDS, 60, agent.obs_dim, agent.action_dim, agent.stores_centers, agent.device)
@@ -200,8 +201,8 @@ def test_a_run_on_a_gpu_is_interrupted_and_resumed_with_the_same_bits(name, tmp_
     words += " hidden=[16,16] batch_size=16 eval_every=100 eval_episodes=1 final_episodes=1"
 
     def train(folder, check=lambda: None):
-        ((config, base),) = run.plan([*words.split(), f"results={folder}"])
-        return run.train(config, base, check)
+        (cell,) = cells_of([*words.split(), f"results={folder}"])
+        return train_cell(cell, check)
 
     calls = []
 
@@ -234,6 +235,6 @@ def test_a_set_that_is_solved_on_the_cpu_is_never_captured(cuda_stand_in, monkey
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="is about machines without a GPU")
 def test_a_gpu_that_is_not_there_is_an_error_in_one_line(capsys):
-    assert run.main(["algo=SRad", "env=R+N", "device=cuda"]) == 2
+    assert run_command(["algo=SRad", "env=R+N", "device=cuda"]) == 2
     message = capsys.readouterr().err
     assert message == "run.py: bad value 'cuda' for device; PyTorch sees no CUDA GPU here (choices: cpu)\n"

@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from helpers import config_of
 
 from core.replay import Replay
-from run import make_trainer, plan
 from store.folder import RunWriter
+from sweep.train import make_trainer
 
 
 class RecordingReplay(Replay):
@@ -20,8 +21,7 @@ class RecordingReplay(Replay):
 def configuration(algo, env, seed, **settings):
     settings = {"steps": 600, "learning_starts": 300, "batch_size": 16, "eval_every": 300} | settings
     settings |= {"eval_episodes": 1, "final_episodes": 1, "hidden": "[32,32]"}
-    ((config, _),) = plan([f"algo={algo}", f"env={env}", f"seed={seed}", *(f"{k}={v}" for k, v in settings.items())])
-    return config
+    return config_of([f"algo={algo}", f"env={env}", f"seed={seed}", *(f"{k}={v}" for k, v in settings.items())])
 
 
 def train(tmp_path, algo, env, seed, **settings):

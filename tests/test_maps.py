@@ -4,16 +4,17 @@ import json
 
 import pytest
 import torch
+from helpers import config_of, run_command
 
-import run
 from algos import ALGORITHMS, PAPER, Algorithm, paper_settings, saved_config, setting_keys
 from algos.nfwpo import NFWPO
 from algos.sac import SAC
 from algos.td3 import TD3
 from constraints import WeightedPositivePart
 from core.agent import Agent
-from core.config import ConfigError, keys_of, resolve, saved_settings, setting, split_names
+from core.config import keys_of, resolve, saved_settings, setting
 from core.maps import Alpha, Gauge, Map, Project, Radial, Sample
+from core.words import ConfigError, split_names
 from envs import TASKS
 
 DIM, OBS = 2, 3
@@ -177,7 +178,7 @@ def test_a_map_of_ones_own_is_one_class(agent, tmp_path, monkeypatch):
     monkeypatch.setitem(ALGORITHMS, "Mine", Algorithm(agent, Soft(), "layer"))
     words = "algo=Mine env=W+M seed=0,1 steps=120 learning_starts=40 batch_size=8 hidden=[8,8] train_freq=1"
     words += " gradient_steps=1 eval_every=60 eval_episodes=1 final_episodes=1"
-    assert run.main([*words.split(), f"results={tmp_path}"]) == 0
+    assert run_command([*words.split(), f"results={tmp_path}"]) == 0
     results = [json.loads(path.read_text()) for path in tmp_path.glob("*/*/seed=*/result.json")]
     assert len(results) == 2 and all(result["gradient_steps"] == 79 for result in results)
     assert all(result["largest_violation"] <= 1e-6 for result in results)
@@ -210,8 +211,8 @@ def test_the_settings_of_a_map_are_keys_of_its_algorithms(monkeypatch):
         scale: float = setting(1.0, "what it is multiplied with")
 
     monkeypatch.setitem(ALGORITHMS, "Mine", Algorithm(TD3, Scaled(), "layer"))
-    ((config, base),) = run.plan(["algo=Mine", "env=R+M", "scale=0.5"])
-    assert (config.scale, base.scale) == (0.5, 1.0) and "scale" in setting_keys()
+    config = config_of(["algo=Mine", "env=R+M", "scale=0.5"])
+    assert (config.scale, config_of("algo=Mine env=R+M").scale) == (0.5, 1.0) and "scale" in setting_keys()
     assert ALGORITHMS["Mine"].build(config, CONSTRAINT, OBS, [0]).map == Scaled(0.5)
     # A setting that only densities use is none of TD3's.
     assert "entropy" not in keys_of(ALGORITHMS["DAlpha"].config_class)

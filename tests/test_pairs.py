@@ -4,10 +4,11 @@ import json
 
 import pytest
 import torch
+from helpers import run_command
 
-import run
 from algos import ALGORITHMS
 from envs import TASKS
+from sweep import train
 
 SHORT = ["learning_starts=20", "batch_size=8", "hidden=[16,16]", "eval_episodes=1", "final_episodes=1"]
 
@@ -33,10 +34,10 @@ def test_pair(tmp_path, capsys, monkeypatch, algo, task):
         fresh.update(trainer.agent.state(0))
         return trainer
 
-    original = run.make_trainer
-    monkeypatch.setattr(run, "make_trainer", make_trainer)
+    original = train.make_trainer
+    monkeypatch.setattr(train, "make_trainer", make_trainer)
     words = [f"algo={algo}", f"env={task}", "seed=0", f"results={tmp_path}", *(f"{k}={v}" for k, v in chosen.items())]
-    assert run.main([*words, *SHORT]) == 0
+    assert run_command([*words, *SHORT]) == 0
     (folder,) = tmp_path.glob("*/*/seed=0")
     result = json.loads((folder / "result.json").read_text())
     assert result["largest_violation"] <= 1e-6
@@ -62,7 +63,7 @@ def test_pair(tmp_path, capsys, monkeypatch, algo, task):
 def test_every_executed_action_is_counted(tmp_path):
     """The counts of training and evaluation environments add up: nothing is executed unchecked."""
     words = ["algo=DPre", "env=R+M", "seed=0-1", "steps=150", f"results={tmp_path}", *SHORT]
-    assert run.main([*words, "eval_every=50"]) == 0
+    assert run_command([*words, "eval_every=50"]) == 0
     for seed in (0, 1):
         (path,) = tmp_path.glob(f"*/*/seed={seed}/result.json")
         # 150 training steps, three evaluations and the final one of an episode each

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_plot import fails
+from helpers import refused_by_plot, run_command
 
 import envs
 import plot
-import run
+import tables
 from algos import ALGORITHMS
-from plots import definitions, illustrations, runtime, tables
+from plots import definitions, illustrations, runtime
 from store.folder import read_run
 
 ROOT = Path(__file__).parents[1]
@@ -61,7 +61,7 @@ def trained(tmp_path_factory):
     """The folder of a short run with one evaluation of one episode."""
     root = tmp_path_factory.mktemp("results")
     words = "algo=SRad env=R+M seed=5 steps=60 learning_starts=40 batch_size=8 hidden=16,16 eval_every=60"
-    assert run.main([*words.split(), "eval_episodes=1", "final_episodes=1", f"results={root}"]) == 0
+    assert run_command([*words.split(), "eval_episodes=1", "final_episodes=1", f"results={root}"]) == 0
     (folder,) = root.glob("R+M/*/seed=5")
     return folder
 
@@ -91,13 +91,15 @@ def test_actions_of_what_cannot_be_played(trained, tmp_path, capsys):
         shutil.copytree(trained, folder)
         return folder
 
-    assert "one folder of a run" in fails(capsys, "actions")
-    assert "is not the folder of a run" in fails(capsys, "actions", tmp_path / "nowhere")
-    assert "W+M is no task of two dimensions (choices: R+N, R+L2" in fails(capsys, "actions", copy("W+M", "SRad"))
-    assert "Mine on R+M is not of this project" in fails(capsys, "actions", copy("R+M", "Mine"))
-    assert "best.pt" in fails(capsys, "actions", copy("R+M", "DRad"))
+    assert "one folder of a run" in refused_by_plot(capsys, "actions")
+    assert "is not the folder of a run" in refused_by_plot(capsys, "actions", tmp_path / "nowhere")
+    assert "W+M is no task of two dimensions (choices: R+N, R+L2" in refused_by_plot(
+        capsys, "actions", copy("W+M", "SRad")
+    )
+    assert "Mine on R+M is not of this project" in refused_by_plot(capsys, "actions", copy("R+M", "Mine"))
+    assert "best.pt" in refused_by_plot(capsys, "actions", copy("R+M", "DRad"))
     (copy("R+L2", "SRad") / "best.pt").unlink()
-    assert "best.pt" in fails(capsys, "actions", tmp_path / "R+L2" / "SRad" / "seed=5")
+    assert "best.pt" in refused_by_plot(capsys, "actions", tmp_path / "R+L2" / "SRad" / "seed=5")
 
 
 # ---- tables of definitions ----
@@ -243,12 +245,12 @@ def test_bars(tmp_path, monkeypatch):
 
 def test_files_that_are_no_measurement(tmp_path, capsys):
     path = tmp_path / "runtime.csv"
-    assert "runtime.csv" in fails(capsys, "runtime", path)
+    assert "runtime.csv" in refused_by_plot(capsys, "runtime", path)
     path.write_text("a,b\n1,2\n")
-    assert "is not a file of bench/runtime.py" in fails(capsys, "runtime", path)
+    assert "is not a file of bench/runtime.py" in refused_by_plot(capsys, "runtime", path)
     write_runtime(path, [])
-    assert "no measurements" in fails(capsys, "runtime", path)
+    assert "no measurements" in refused_by_plot(capsys, "runtime", path)
     write_runtime(path, [row("DPro", 1, 0, 1.0), row("DPro", 1, 1, 1.0, machine="two")])
-    assert "different machine: one, two" in fails(capsys, "runtime", path)
+    assert "different machine: one, two" in refused_by_plot(capsys, "runtime", path)
     write_runtime(path, [row("DPro", 1, 0, "soon")])
-    assert "row 1 lacks a number" in fails(capsys, "runtime", path)
+    assert "row 1 lacks a number" in refused_by_plot(capsys, "runtime", path)

@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import refused_by_plot, write_run
 from scipy import stats
 from synthetic import CONDITIONS, write_results
 
 import plot
-from plots import figures, grouping, paper, rewards, tables
+import tables
+from plots import figures, grouping, paper, rewards
 from store import folder as results
 from store import provenance
 
@@ -45,40 +47,9 @@ PAPER_ROWS = {
 }
 
 
-def write_run(root, task, algo, seed, result=None, overrides=None, evaluations=4, base=0.0, **config):
-    """A run with `evaluations` evaluations, finished with the mean return `result` unless that is None."""
-    overrides = overrides or {}
-    folder = results.run_folder(root, task, results.variant_name(algo, overrides), seed)
-    settings = {
-        "algo": algo,
-        "env": task,
-        "seed": str(seed),
-        "steps": STEPS,
-        "gamma": 0.99,
-        **overrides,
-        **config,
-    }
-    writer = results.RunWriter(folder, settings, {"commit": None}, eval_episodes=3)
-    rng = np.random.default_rng(seed)
-    for step in range(5_000, 5_000 * evaluations + 1, 5_000):
-        writer.append_evaluation(step, base + step / 1_000 + rng.normal(size=3), step / 100)
-    if result is not None:
-        writer.finish({"return_mean": result, "returns": [result] * 50})
-    return writer
-
-
 def records(root, table):
     with open(Path(root, "tables", f"{table}.csv"), newline="") as file:
         return list(csv.DictReader(file))
-
-
-def fails(capsys, *arguments):
-    """The one line with which plot.py refuses `arguments`."""
-    assert plot.main([str(argument) for argument in arguments]) == 2
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1
-    assert "Traceback" not in captured.err
-    return captured.err
 
 
 # ---- run folders ----
@@ -634,25 +605,25 @@ def test_usage(capsys):
 
 
 def test_refusals(tmp_path, capsys):
-    assert "not a folder" in fails(capsys, tmp_path / "nowhere")
-    assert "no runs in" in fails(capsys, tmp_path)
+    assert "not a folder" in refused_by_plot(capsys, tmp_path / "nowhere")
+    assert "no runs in" in refused_by_plot(capsys, tmp_path)
     write_run(tmp_path, "W+M", "SRad", 0, result=1.0)
     write_run(tmp_path, "R+N", "DPre+", 0, result=1.0)
-    assert "'evn'" in (line := fails(capsys, tmp_path, "evn=W+M")) and "did you mean env?" in line
-    assert "did you mean SRad?" in (line := fails(capsys, tmp_path, "algo=srat")) and "DPre+" in line
-    assert "choices: R+N, W+M" in fails(capsys, tmp_path, "env=HC+O")
-    assert "choices: md, csv, tex, png, pdf" in fails(capsys, tmp_path, "format=jpg")
-    assert "given twice" in fails(capsys, tmp_path, "env=W+M", "env=R+N")
-    assert "expected env=value" in fails(capsys, tmp_path, "env=")
-    assert "expected one folder of results" in fails(capsys, tmp_path, "more")
-    assert "unexpected 'more'" in fails(capsys, "maps", "more")
-    assert "env= applies to a folder of results, not to tables" in fails(capsys, "tables", "env=W+M")
-    assert "choices: png, pdf" in fails(capsys, "maps", "format=md")
-    assert "expected one folder of results" in fails(capsys, "env=W+M")
-    assert "no readable runs" in fails(capsys, tmp_path, "env=W+M", "algo=DPre+")
+    assert "'evn'" in (line := refused_by_plot(capsys, tmp_path, "evn=W+M")) and "did you mean env?" in line
+    assert "did you mean SRad?" in (line := refused_by_plot(capsys, tmp_path, "algo=srat")) and "DPre+" in line
+    assert "choices: R+N, W+M" in refused_by_plot(capsys, tmp_path, "env=HC+O")
+    assert "choices: md, csv, tex, png, pdf" in refused_by_plot(capsys, tmp_path, "format=jpg")
+    assert "given twice" in refused_by_plot(capsys, tmp_path, "env=W+M", "env=R+N")
+    assert "expected key=value, got 'env='" in refused_by_plot(capsys, tmp_path, "env=")
+    assert "expected one folder of results" in refused_by_plot(capsys, tmp_path, "more")
+    assert "unexpected 'more'" in refused_by_plot(capsys, "maps", "more")
+    assert "env= applies to a folder of results, not to tables" in refused_by_plot(capsys, "tables", "env=W+M")
+    assert "choices: png, pdf" in refused_by_plot(capsys, "maps", "format=md")
+    assert "expected one folder of results" in refused_by_plot(capsys, "env=W+M")
+    assert "no readable runs" in refused_by_plot(capsys, tmp_path, "env=W+M", "algo=DPre+")
     blocked = tmp_path / "file"
     blocked.write_text("")
-    assert "file" in fails(capsys, tmp_path, f"out={blocked}")
+    assert "file" in refused_by_plot(capsys, tmp_path, f"out={blocked}")
     assert not (tmp_path / "tables").exists()
 
 

@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 import pytest
+from helpers import write_run
 from scipy import stats
-from test_plot import write_run
 
 import plot
 from plots import statistics

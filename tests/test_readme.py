@@ -23,7 +23,7 @@ def test_example(code, tmp_path, monkeypatch):
         for table, before in ((TASKS, tasks), (ALGORITHMS, algorithms)):
             table.clear()
             table.update(before)
-    trained = code.count("run.main(")
+    trained = code.count("train_words(")
     assert len(list(tmp_path.glob("results/*/*/seed=0/result.json"))) == 4 * trained
 
 

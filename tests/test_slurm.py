@@ -14,13 +14,12 @@ import time
 from pathlib import Path
 
 import pytest
-from test_resume import assert_identical, outcome_of
+from helpers import assert_identical, outcome_of, run_command
 
-import run
 from store.checkpoint import saved_step
 from store.folder import find_runs, is_finished
 from store.slurm import queue
-from sweep.cells import state_of
+from sweep.states import Stage, state_of
 from sweep.status import find_cells
 
 ROOT = Path(__file__).parents[1]
@@ -117,7 +116,7 @@ class Requeued(Fault):
     def follow_up(self):
         if self.is_queued():
             return False
-        assert state_of(self.cell, {}).name == "interrupted"
+        assert state_of(self.cell, {}).stage is Stage.INTERRUPTED
         return not subprocess.run(["scontrol", "requeue", self.job], timeout=60).returncode
 
 
@@ -193,9 +192,9 @@ def test_cells_that_are_killed_preempted_or_out_of_time_end_as_on_one_machine(tm
         assert len(info["resumed"]) >= 1 and info["resumed"][0]["step"] > 0
         assert info["command"].startswith("run.py algo=")
     assert faults["Preempted"].job == faults["Preempted"].first and faults["OutOfTime"].job == faults["OutOfTime"].first
-    assert run.main([*WORDS.split(), "threads=1", f"results={tmp_path / 'local'}"]) == 0
+    assert run_command([*WORDS.split(), "threads=1", f"results={tmp_path / 'local'}"]) == 0
     capsys.readouterr()
-    assert run.main(["status", str(root)]) == 0
+    assert run_command(["status", str(root)]) == 0
     assert "5 cells: 5 finished" in capsys.readouterr().out
     outcomes = [
         {str(folder.relative_to(tree)): outcome_of(folder) for folder in find_runs(tree)}

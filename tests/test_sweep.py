@@ -10,21 +10,21 @@ import time
 from pathlib import Path
 
 import pytest
-from test_resume import assert_identical, outcome_of
+from helpers import assert_identical, cells_of, outcome_of, run_command
 
 import plot
-import run
-from core.config import parse_seeds
+from core.config import Config, parse_seeds
 from store import slurm
 from store.checkpoint import saved_step
 from store.folder import find_runs
 from store.interrupt import Interrupted, Interrupts
 from store.lock import LockedError, lock_owner, run_lock
 from sweep import estimates
-from sweep.cells import Cell, cell_of, command_words, format_seeds, job_states, state_of
+from sweep.cells import CellFolders, format_seeds
 from sweep.plan import make_plan
 from sweep.progress import Display, End
 from sweep.settings import parse_sweep
+from sweep.states import Stage, job_states, state_of
 from sweep.status import find_cells
 
 ROOT = Path(__file__).parents[1]
@@ -60,7 +60,7 @@ def outcomes(root):
 
 
 def plan_of(words, root, jobs=()):
-    return make_plan(run.plan([*words.split(), f"results={root}"]), dict(jobs))
+    return make_plan(cells_of([*words.split(), f"results={root}"]), dict(jobs))
 
 
 # ---------------------------------------------------------------- settings
@@ -69,12 +69,12 @@ def plan_of(words, root, jobs=()):
 def test_settings_of_a_sweep_are_no_settings_of_its_runs():
     words = ["algo=SRad", "jobs=3", "dry=true", "env=W+M", "seed=1"]
     sweep, left = parse_sweep(words)
-    assert left == ["algo=SRad", "env=W+M", "seed=1"] and sweep.wanted
+    assert left == {"algo": "SRad", "env": "W+M", "seed": "1"} and sweep.wanted
     assert (sweep.settings.jobs, sweep.settings.dry, sweep.settings.launcher) == (3, True, "local")
     words = "algo=SRad env=W+M launcher=slurm slurm.hours=1.5 slurm.cpus=4 slurm.account=me slurm.mail_type=END"
     sweep, left = parse_sweep(words.split())
     assert (sweep.slurm.hours, sweep.slurm.cpus, sweep.slurm.gpus) == (1.5, 4, 0)
-    assert sweep.sbatch == {"account": "me", "mail-type": "END"} and left == ["algo=SRad", "env=W+M"]
+    assert sweep.sbatch == {"account": "me", "mail-type": "END"} and left == {"algo": "SRad", "env": "W+M"}
     assert not parse_sweep(["algo=SRad", "env=W+M"])[0].wanted
     parse_sweep(["launcher=slurm", "slurm.hours=0.03", "slurm.signal=USR2@30"])
 
@@ -109,14 +109,14 @@ def test_settings_of_a_sweep_are_no_settings_of_its_runs():
     ],
 )
 def test_wrong_settings(capsys, tmp_path, words, said):
-    assert run.main(["algo=SRad", "env=W+M", *words.split(), f"results={tmp_path}"]) == 2
+    assert run_command(["algo=SRad", "env=W+M", *words.split(), f"results={tmp_path}"]) == 2
     captured = capsys.readouterr()
     assert said in captured.err and captured.err.count("\n") == 1 and captured.err.startswith("run.py: ")
     assert not captured.out and not list(tmp_path.iterdir())
 
 
 def test_usage_names_the_settings_of_sweeps(capsys):
-    assert run.main([]) == 0
+    assert run_command([]) == 0
     out = capsys.readouterr().out
     for name in ("jobs", "launcher", "dry", "slurm.partition", "slurm.gpus", "slurm.hours", "status results/"):
         assert f" {name}" in out
@@ -132,24 +132,27 @@ def test_seeds_as_words(text):
 
 def test_the_words_of_a_cell_are_the_same_cell(tmp_path):
     words = "algo=all env=R+L2,W+M seed=0-9 hidden=[64,32] gamma=0.5 fw_learning_rate=0.5 gsde=false train_freq=7"
-    cells = run.plan([*words.split(), f"results={tmp_path}", "threads=3"])
+    cells = cells_of([*words.split(), f"results={tmp_path}", "threads=3"])
     assert len(cells) == 26
     for cell in cells:
-        assert run.plan(command_words(*cell)) == [cell]
+        (same,) = cells_of(cell.words)
+        assert (same, same.config, same.paper) == (cell, cell.config, cell.paper)
 
 
 # ---------------------------------------------------------------- plans and estimates
 
 
 def test_the_longest_cell_comes_first_and_what_is_done_shortens_it(tmp_path):
-    names = [(e.config.env, e.config.algo) for e in plan_of("algo=DPre,SAlpha env=R+N,HC+O seed=0-9", tmp_path)]
+    names = [
+        (e.cell.config.env, e.cell.config.algo) for e in plan_of("algo=DPre,SAlpha env=R+N,HC+O seed=0-9", tmp_path)
+    ]
     assert names == [("HC+O", "SAlpha"), ("HC+O", "DPre"), ("R+N", "SAlpha"), ("R+N", "DPre")]
     (whole,) = plan_of("algo=SAlpha env=HC+O seed=0-9", tmp_path)
     for folder in whole.cell.folders:
         (folder / "checkpoint").mkdir(parents=True)
         (folder / "checkpoint" / "replay-0-900000.f32").touch()
     (entry,) = plan_of("algo=SAlpha env=HC+O seed=0-9", tmp_path)
-    assert (entry.state.name, entry.state.step) == ("interrupted", 900_000)
+    assert (entry.state.stage, entry.state.step) == (Stage.INTERRUPTED, 900_000)
     assert 0.05 < entry.remaining / whole.remaining < 0.15 and 0.85 < entry.progress() < 0.95
     assert whole.seconds(0) == whole.remaining and whole.seconds(1_000_000) < 0.01 * whole.seconds(0)
 
@@ -168,7 +171,7 @@ def test_estimates_grow_with_what_there_is_to_do(tmp_path):
     per_seed = (ten - one) / 9
     assert 1e6 * 4 * (2 * 17 + 3 * 6 + 2) <= per_seed <= 1e6 * 4 * (2 * 17 + 3 * 6 + 2) + 50e6
     assert entry("algo=DPre seed=0 buffer_size=10").memory < one
-    assert {row for row in estimates._rates()} == {(c.env, c.algo) for c, _ in run.plan(["algo=all", "env=all"])}
+    assert {row for row in estimates._rates()} == {(c.task, c.config.algo) for c in cells_of(["algo=all", "env=all"])}
 
 
 def test_makespan():
@@ -197,8 +200,7 @@ def test_finished_runs_correct_the_estimates(tmp_path):
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text("algo: DPre\nenv: R+N\nseed: '0'\nsteps: 300000\n")
     (folder / "evaluations.csv").write_text("step,return_mean,return_1,seconds\n")
-    config, base = run.plan(["algo=DPre", "env=R+N", "seed=0"])[0]
-    took = 3.0 * estimates.seconds(run.Config("DPre", "R+N", steps=300_000), base, 1)
+    took = 3.0 * estimates.seconds(Config("DPre", "R+N", steps=300_000), 1)
     result = {"return_mean": 1.0, "seeds_in_lockstep": 1, "seconds": {"total": took}}
     for steps in (estimates.TELLING_STEPS - 1, estimates.TELLING_STEPS):
         assert after_a_run_of(steps, result, folder, words, tmp_path, before) == (steps >= estimates.TELLING_STEPS)
@@ -240,7 +242,7 @@ def test_the_time_left_follows_the_pace_so_far(tmp_path):
 
 def test_a_dry_run_prints_the_plan_and_leaves_nothing(capsys, tmp_path):
     words = f"algo=DPre,SRad env=R+N,H+M seed=0-4 jobs=2 dry=true results={tmp_path / 'none'}"
-    assert run.main(words.split()) == 0
+    assert run_command(words.split()) == 0
     out = capsys.readouterr().out
     assert out.count(" new ") == 4 and "4 cells: 4 new" in out and "0-4" in out and " GB" in out
     assert "on one core in all" in out and "with 2 cells at a time" in out
@@ -252,7 +254,7 @@ def test_a_dry_run_prints_the_plan_and_leaves_nothing(capsys, tmp_path):
 
 def test_a_cell_that_fails_is_reported_and_the_others_are_carried_on(tmp_path):
     words = f"algo=DPre,SRad env=R+N seed=3,5 {SHORT} jobs=2"
-    broken = next(e.cell for e in plan_of(words.replace(" jobs=2", ""), tmp_path) if e.config.algo == "SRad")
+    broken = next(e.cell for e in plan_of(words.replace(" jobs=2", ""), tmp_path) if e.cell.config.algo == "SRad")
     lock = broken.folders[1].with_name("seed=5.lock")
     lock.mkdir(parents=True)  # in place of a file: the process of this cell cannot go on
     process = start(words, tmp_path)
@@ -260,9 +262,9 @@ def test_a_cell_that_fails_is_reported_and_the_others_are_carried_on(tmp_path):
     assert process.returncode == 4, err
     assert "1 of 2 cells done, 1 failed" in out
     assert f"SRad R+N seed=3,5 failed: run.py: {lock}: is a directory\n    {broken.record('log')}" in err
-    assert state_of(broken, {}).name == "failed" and "is a directory" in state_of(broken, {}).detail
-    (done,) = [cell for cell in find_cells(tmp_path) if cell != broken]
-    assert state_of(done, {}).name == "finished"
+    assert state_of(broken, {}).stage is Stage.FAILED and "is a directory" in state_of(broken, {}).detail
+    (done,) = [cell for cell in find_cells(tmp_path) if cell.variant != broken.variant]
+    assert state_of(done, {}).stage is Stage.FINISHED
     assert done.record("log").read_text().count("return ") == 2 and not done.record("end").exists()
 
     assert plot.main([str(tmp_path), "format=md"]) == 0
@@ -273,7 +275,7 @@ def test_a_cell_that_fails_is_reported_and_the_others_are_carried_on(tmp_path):
     assert again.returncode == 0 and "cells: 2, finished already: 1" in err and "2 of 2 cells done" in out
     assert not broken.record("end").exists() and done.record("log").read_text().count("+ ") == 1
     whole = tmp_path / "whole"
-    assert run.main([*words.replace("jobs=2", "threads=1").split(), f"results={whole}"]) == 0
+    assert run_command([*words.replace("jobs=2", "threads=1").split(), f"results={whole}"]) == 0
     assert_identical({k: v for k, v in outcomes(tmp_path).items() if not k.startswith("whole")}, outcomes(whole))
 
 
@@ -287,7 +289,7 @@ def test_ctrl_c_checkpoints_all_and_the_same_command_goes_on_bit_by_bit(tmp_path
     assert process.returncode == 128 + signal.SIGINT, err
     assert "3 not done" in out and "the same command resumes" in err and "Traceback" not in err
     assert not list(root.rglob("seed=*.lock"))
-    states = sorted(state_of(cell, {}).name for cell in find_cells(root))
+    states = sorted(state_of(cell, {}).stage.value for cell in find_cells(root))
     assert states == ["interrupted", "interrupted", "new"]
     assert sum("interrupted at step" in log.read_text() for log in root.glob("sweep/*/*/*.log")) == 2
 
@@ -295,14 +297,16 @@ def test_ctrl_c_checkpoints_all_and_the_same_command_goes_on_bit_by_bit(tmp_path
     out, err = again.communicate(timeout=240)
     assert again.returncode == 0 and "3 of 3 cells done" in out, err
     assert sum("resuming from step" in log.read_text() for log in root.glob("sweep/*/*/*.log")) == 2
-    assert run.main([*words.replace(" jobs=2", "").split(), f"results={tmp_path / 'whole'}"]) == 0
+    assert run_command([*words.replace(" jobs=2", "").split(), f"results={tmp_path / 'whole'}"]) == 0
     assert_identical(outcomes(root), outcomes(tmp_path / "whole"))
 
 
 def test_a_killed_process_and_a_diverging_seed_leave_the_others_alone(tmp_path):
     words = f"algo=DPre,DRad env=R+L2 seed=3,5 {SHORT.replace('steps=300', 'steps=800')} learning_rate=1e30 jobs=2"
     process = start(words, tmp_path)
-    folder = next(e.cell for e in plan_of(words.replace(" jobs=2", ""), tmp_path) if e.config.algo == "DRad").folders[0]
+    folder = next(
+        e.cell for e in plan_of(words.replace(" jobs=2", ""), tmp_path) if e.cell.config.algo == "DRad"
+    ).folders[0]
     lock = folder.with_name("seed=3.lock")
     wait_until(lambda: lock.exists() and lock_owner(folder), process)
     os.kill(json.loads(lock.read_text())["pid"], signal.SIGKILL)
@@ -315,14 +319,16 @@ def test_a_killed_process_and_a_diverging_seed_leave_the_others_alone(tmp_path):
 
 def test_cells_that_others_have_are_left_out(tmp_path, monkeypatch, capsys):
     words = [*f"algo=DPre,SRad,NFW env=R+N seed=3 {SHORT} jobs=1 threads=1".split(), f"results={tmp_path / 'results'}"]
-    cells = {e.config.algo: e.cell for e in plan_of(f"algo=DPre,SRad,NFW env=R+N seed=3 {SHORT}", tmp_path / "results")}
+    cells = {
+        e.cell.config.algo: e.cell for e in plan_of(f"algo=DPre,SRad,NFW env=R+N seed=3 {SHORT}", tmp_path / "results")
+    }
     fake(tmp_path, monkeypatch, squeue="echo 7 PENDING")
     cells["SRad"].write("job", {"job": "7", "log": "x"})
     lock = cells["NFW"].folders[0].with_name("seed=3.lock")
     lock.parent.mkdir(parents=True)
     lock.write_text(json.dumps({"pid": 7, "host": "elsewhere"}))
     for more in ([], ["overwrite=true"]):
-        assert run.main([*words, *more]) == 2
+        assert run_command([*words, *more]) == 2
         captured = capsys.readouterr()
         assert "1 of 1 cells done" in captured.out and "failed" not in captured.err
         (line,) = [line for line in captured.err.splitlines() if "left out" in line]
@@ -345,19 +351,19 @@ def fake(tmp_path, monkeypatch, **programs):
 
 
 def test_states(tmp_path):
-    cell = Cell(tmp_path, "R+N", "DPre", (0, 1))
-    assert state_of(cell, {}).name == "new"
+    cell = CellFolders(tmp_path, "R+N", "DPre", (0, 1))
+    assert state_of(cell, {}).stage is Stage.NEW
     cell.write("job", {"job": "12_3", "log": "12_3.err"})
-    assert state_of(cell, {"12_3": "PENDING"}).name == "queued"
-    assert state_of(cell, {"12_3": "RUNNING", "12_4": "PENDING"}).name == "running"
-    assert state_of(cell, {"12_4": "RUNNING"}).name == "new"
+    assert state_of(cell, {"12_3": "PENDING"}).stage is Stage.QUEUED
+    assert state_of(cell, {"12_3": "RUNNING", "12_4": "PENDING"}).stage is Stage.RUNNING
+    assert state_of(cell, {"12_4": "RUNNING"}).stage is Stage.NEW
     for folder in cell.folders:
         folder.mkdir(parents=True)
     assert "job 12_3 is gone" in state_of(cell, {}).detail
     (cell.folders[0] / "checkpoint").mkdir()
     (cell.folders[0] / "checkpoint" / "replay-20-40.f32").touch()
     (cell.folders[1] / "result.json").touch()
-    assert (state_of(cell, {}).name, state_of(cell, {}).step) == ("interrupted", 40)
+    assert (state_of(cell, {}).stage, state_of(cell, {}).step) == (Stage.INTERRUPTED, 40)
     log = tmp_path / "log"
     log.write_text("  5%|bar\r 10%|bar\nrun.py: the reason\nsrun: error: vm: task 0: Exited\n\n")
     cell.note_end(2, log)
@@ -367,21 +373,21 @@ def test_states(tmp_path):
     info, end = cell.folders[0] / "info.json", cell.record("end")
     info.touch()
     os.utime(info, ns=(0, end.stat().st_mtime_ns - 1))
-    assert state_of(cell, {}).name == "failed"
+    assert state_of(cell, {}).stage is Stage.FAILED
     os.utime(info, ns=(0, end.stat().st_mtime_ns + 1))  # a run.py of its own, after that
-    assert (state_of(cell, {}).name, state_of(cell, {}).step) == ("interrupted", 40)
+    assert (state_of(cell, {}).stage, state_of(cell, {}).step) == (Stage.INTERRUPTED, 40)
     info.unlink()
     lock = cell.folders[0].with_name("seed=0.lock")
     lock.write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
     running = state_of(cell, {})
-    assert (running.name, running.detail) == ("running", f"process {os.getppid()} on {socket.gethostname()}")
+    assert (running.stage, running.detail) == (Stage.RUNNING, f"process {os.getppid()} on {socket.gethostname()}")
     lock.write_text(json.dumps({"pid": os.getppid(), "host": "elsewhere"}))
     assert state_of(cell, {}).detail == f"process {os.getppid()} on elsewhere"
     lock.unlink()
     (cell.folders[0] / "failed.json").write_text(json.dumps({"step": 7, "quantity": "loss"}))
     (cell.folders[0] / "config.yaml").write_text("{}")
     (cell.folders[0] / "evaluations.csv").write_text("step,return_mean,return_1,seconds\n")
-    assert state_of(cell, {}).name == "finished" and "seed 0: failed at step 7: loss" in state_of(cell, {}).detail
+    assert state_of(cell, {}).stage is Stage.FINISHED and "seed 0: failed at step 7: loss" in state_of(cell, {}).detail
     cell.note_end(3, log)
     assert not cell.record("end").exists()
 
@@ -389,21 +395,21 @@ def test_states(tmp_path):
 def test_status_of_a_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PATH", str(tmp_path))
     root = tmp_path / "results"
-    queued = Cell(root, "H+M", "SRad,steps=10", (0, 1, 2))
+    queued = CellFolders(root, "H+M", "SRad,steps=10", (0, 1, 2))
     queued.write("job", {"job": "7_0", "log": "x"})
-    run.main(["algo=DPre", "env=R+N", "seed=3,5", *SHORT.split(), f"results={root}"])
+    run_command(["algo=DPre", "env=R+N", "seed=3,5", *SHORT.split(), f"results={root}"])
     started = root / "R+N" / "DPre,steps=900" / "seed=4"
     started.mkdir(parents=True)
     (started / "config.yaml").write_text("steps: 900\n")
     (started / "evaluations.csv").write_text("step,return_mean,return_1,seconds\n300,1.0,1.0,1.0\n")
     capsys.readouterr()
-    assert run.main(["status", str(root)]) == 0
+    assert run_command(["status", str(root)]) == 0
     out = capsys.readouterr().out
     assert (
         "3 cells: 1 unknown, 1 finished, 1 interrupted" in out and "300/900" in out and "squeue does not answer" in out
     )
     fake(tmp_path, monkeypatch, squeue="echo 7_0 PENDING")
-    assert run.main(["status", str(root)]) == 0
+    assert run_command(["status", str(root)]) == 0
     out = capsys.readouterr().out
     assert "1 queued" in out and "job 7_0" in out and "squeue does not answer" not in out
 
@@ -411,7 +417,7 @@ def test_status_of_a_folder(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("words", [["status"], ["status", "a", "b"], ["status", "nowhere"], ["status", "."]])
 def test_status_of_what_is_no_folder_of_results(tmp_path, monkeypatch, capsys, words):
     monkeypatch.chdir(tmp_path)
-    assert run.main(words) == 2
+    assert run_command(words) == 2
     err = capsys.readouterr().err
     assert err.startswith("run.py: ") and err.count("\n") == 1
 
@@ -485,18 +491,18 @@ def test_the_signals_of_batch_systems_are_noted(signum):
     with Interrupts() as interrupts:
         os.kill(os.getpid(), signum)
         with pytest.raises(Interrupted):
-            interrupts.check()
+            interrupts.stop_if_asked()
 
 
 def test_without_slurm_or_submitit_one_line_says_so(tmp_path, monkeypatch, capsys):
     words = ["algo=DPre", "env=R+N", "launcher=slurm", f"results={tmp_path / 'results'}"]
     with monkeypatch.context() as patch:
         patch.setenv("PATH", str(tmp_path))
-        assert run.main(words) == 2
+        assert run_command(words) == 2
     assert "there is no sbatch on the PATH" in capsys.readouterr().err
     fake(tmp_path, monkeypatch, sbatch="exit 1")
     monkeypatch.setitem(sys.modules, "submitit", None)
-    assert run.main(words) == 2
+    assert run_command(words) == 2
     assert "pip install '.[slurm]'" in capsys.readouterr().err
     assert not (tmp_path / "results").exists()
 
@@ -531,9 +537,9 @@ def test_only_what_is_neither_finished_nor_queued_is_submitted(cluster, capsys):
         ],
         f"results={root}",
     ]
-    run.main(["algo=NFW", "env=R+L2", "seed=3,5", *SHORT.split(), f"results={root}"])
+    run_command(["algo=NFW", "env=R+L2", "seed=3,5", *SHORT.split(), f"results={root}"])
     capsys.readouterr()
-    assert run.main(words) == 0
+    assert run_command(words) == 0
     out = capsys.readouterr().out
     assert "6 cells: 5 new, 1 finished" in out and "submitted 5 as job 41" in out
     script = (cluster / "41.sh").read_text()
@@ -546,11 +552,11 @@ def test_only_what_is_neither_finished_nor_queued_is_submitted(cluster, capsys):
     assert sorted(cells) == [f"41_{task}" for task in range(5)]
 
     (cluster / "queue").write_text("".join(f"41_{task} PENDING\n" for task in range(5)))
-    assert run.main(words) == 0
+    assert run_command(words) == 0
     assert "nothing to submit" in capsys.readouterr().out and not (cluster / "42.sh").exists()
 
     (cluster / "queue").write_text("41_0 RUNNING\n41_1 PENDING\n41_2 RUNNING\n41_4 COMPLETING\n")
-    assert run.main(words) == 0
+    assert run_command(words) == 0
     assert "submitted 1 as job 42" in capsys.readouterr().out
     assert cells["41_3"].read("job")["job"] == "42" and "--array" not in (cluster / "42.sh").read_text()
     assert len(list(root.glob("*/*/seed=*/result.json"))) == 2
@@ -558,24 +564,24 @@ def test_only_what_is_neither_finished_nor_queued_is_submitted(cluster, capsys):
 
 def test_a_job_of_another_cluster_is_not_taken_for_gone(cluster, monkeypatch, capsys):
     words = ["algo=DPre", "env=R+N", f"results={cluster / 'results'}"]
-    assert run.main([*words, "launcher=slurm"]) == 0
+    assert run_command([*words, "launcher=slurm"]) == 0
     (cell,) = find_cells_of(cluster)
     assert cell.read("job")["cluster"] == "big"
-    assert state_of(cell, job_states([cell])).name == "new"  # it is over
+    assert state_of(cell, job_states([cell])).stage is Stage.NEW  # it is over
     monkeypatch.setenv("SLURM_CLUSTER_NAME", "small")
     (cluster / "queue").write_text("41 RUNNING\n")  # another job of that number
     capsys.readouterr()
-    assert run.main([*words, "launcher=slurm"]) == 0
+    assert run_command([*words, "launcher=slurm"]) == 0
     said = f"Slurm does not tell here of job 41 of cluster big; if that is over, delete {cell.record('job')}"
     out = capsys.readouterr().out
     assert f"DPre R+N is not submitted: {said}" in out and "nothing to submit" in out
     assert not (cluster / "42.sh").exists()
-    assert run.main(["status", str(cluster / "results")]) == 0
+    assert run_command(["status", str(cluster / "results")]) == 0
     out = capsys.readouterr().out
     assert "1 cell: 1 unknown" in out and said in out
     cell.note_end(2, cluster / "log")  # the job itself has said that it is over
-    assert state_of(cell, job_states([cell])).name == "failed"
-    assert run.main([*words, "launcher=slurm", "slurm.clusters=huge"]) == 0
+    assert state_of(cell, job_states([cell])).stage is Stage.FAILED
+    assert run_command([*words, "launcher=slurm", "slurm.clusters=huge"]) == 0
     assert cell.read("job")["cluster"] == "huge"
 
 
@@ -583,7 +589,7 @@ def test_a_submission_that_another_host_left_open_names_its_lock(cluster, capsys
     lock = cluster / "results" / "sweep" / "submission.lock"
     lock.parent.mkdir(parents=True)
     lock.write_text(json.dumps({"pid": 7, "host": "elsewhere"}))
-    assert run.main(["algo=DPre", "env=R+N", "launcher=slurm", f"results={cluster / 'results'}"]) == 2
+    assert run_command(["algo=DPre", "env=R+N", "launcher=slurm", f"results={cluster / 'results'}"]) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and f"by process 7 on elsewhere; if that has ended, delete {lock}" in err
 
@@ -591,24 +597,24 @@ def test_a_submission_that_another_host_left_open_names_its_lock(cluster, capsys
 def test_what_sbatch_refuses_is_said_in_one_line(cluster, monkeypatch, capsys):
     words = ["algo=DPre", "env=R+N", "launcher=slurm", f"results={cluster / 'results'}"]
     fake(cluster, monkeypatch, sbatch="echo 'sbatch: error: invalid partition specified: x' >&2; exit 1")
-    assert run.main([*words, "slurm.partition=x"]) == 2
+    assert run_command([*words, "slurm.partition=x"]) == 2
     err = capsys.readouterr().err
     assert err == "run.py: sbatch: error: invalid partition specified: x\n"
     refusal = "if [ \"$1\" = --help ]; then echo '  --account=name --nice'; exit; fi"
     fake(cluster, monkeypatch, sbatch=f"{refusal}; echo \"sbatch: unrecognized option '--acount=me'\" >&2; exit 1")
-    assert run.main([*words, "slurm.acount=me"]) == 2
+    assert run_command([*words, "slurm.acount=me"]) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and "unknown sbatch parameter 'acount'; did you mean account?" in err
     fake(cluster, monkeypatch, squeue="exit 1")
     next(iter(find_cells_of(cluster))).write("job", {"job": "41", "log": "x"})
-    assert run.main(words) == 2
+    assert run_command(words) == 2
     assert "squeue does not answer" in capsys.readouterr().err
 
 
 @pytest.fixture
 def job(cluster, monkeypatch):
     """A job of a cell, which `end(code, step)` lets train up to a checkpoint of that step and end."""
-    from sweep import job as module
+    from sweep import slurm as module
 
     (cluster / "queue").write_text("41 RUNNING\n")
     fake(cluster, monkeypatch, scontrol=f'echo "$@" >> {cluster}/scontrol')
@@ -622,23 +628,22 @@ def job(cluster, monkeypatch):
     previous = signal.signal(signal.SIGUSR2, lambda *_: subprocess.check_call(["scontrol", "requeue", "41"]))
 
     def end(code, step):
-        def main(words):
+        def train_cells(cells, stop_if_asked):
+            assert cells == [cell]
             (cell.folders[0] / "checkpoint").mkdir(parents=True, exist_ok=True)
             (cell.folders[0] / "checkpoint" / f"replay-0-{step}.f32").touch()
-            return code
+            raise Interrupted(code - 128)
 
-        monkeypatch.setattr(run, "main", main)
+        monkeypatch.setattr(module, "train_cells", train_cells)
         with pytest.raises((SystemExit, subprocess.CalledProcessError)):
-            module.Job(["words"], cell)()
+            module.Job(cell)()
         signal.signal(signal.SIGUSR2, lambda *_: subprocess.check_call(["scontrol", "requeue", "41"]))
         requeued = (cluster / "scontrol").exists()
         (cluster / "scontrol").unlink(missing_ok=True)
         return requeued
 
     end.cell = cell
-    with monkeypatch.context() as patch:
-        patch.setattr(sys, "argv", sys.argv)
-        yield end
+    yield end
     signal.signal(signal.SIGUSR2, previous)
 
 
@@ -662,15 +667,15 @@ def test_a_job_that_cannot_be_requeued_says_so(cluster, monkeypatch, job):
     fake(cluster, monkeypatch, scontrol="exit 1")
     job(USR2, 20)
     state = state_of(job.cell, {})
-    assert state.name == "failed" and "could not be requeued: " in state.detail and "scontrol" in state.detail
+    assert state.stage is Stage.FAILED and "could not be requeued: " in state.detail and "scontrol" in state.detail
 
 
 def test_a_job_without_a_checkpoint_before_its_time_limit_is_not_requeued_for_ever(job):
     assert job(USR2, 20) and not job(USR2, 20)
     state = state_of(job.cell, {})
-    assert state.name == "failed" and "not requeued: no checkpoint between" in state.detail
+    assert state.stage is Stage.FAILED and "not requeued: no checkpoint between" in state.detail
     assert job(TERM, 20)  # preempted at once
 
 
 def find_cells_of(cluster):
-    return [cell_of(*cell) for cell in run.plan(["algo=DPre", "env=R+N", f"results={cluster / 'results'}"])]
+    return cells_of(["algo=DPre", "env=R+N", f"results={cluster / 'results'}"])

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import config_of
 from torch.utils.flop_counter import FlopCounterMode
 
 import envs
-import run
 from algos import ALGORITHMS
 from bench import peer, phases
 from bench.floor import Floor, update_products
@@ -39,7 +39,7 @@ def bench(monkeypatch):
 @pytest.mark.parametrize(("base", "name"), [("TD3", "DPre"), ("SAC", "SPre")])
 @pytest.mark.parametrize("seeds", [1, 3])
 def test_the_floor_has_the_products_of_an_update(base, name, seeds):
-    ((config, _),) = run.plan([f"algo={name}", "env=HC+O"])
+    config = config_of([f"algo={name}", "env=HC+O"])
     agent = ALGORITHMS[name].build(config, envs.constraint("HC+O"), OBS, range(seeds))
     batch = config.batch_size
     shapes = [(OBS,), (ACTION,), (), (), (OBS,)]
@@ -56,7 +56,7 @@ def test_the_floor_has_the_products_of_an_update(base, name, seeds):
 
 
 def test_the_floor_multiplies_what_the_list_says():
-    ((config, _),) = run.plan(["algo=DPre", "env=HC+O", "hidden=[5,4]", "batch_size=3"])
+    config = config_of(["algo=DPre", "env=HC+O", "hidden=[5,4]", "batch_size=3"])
     update = update_products("TD3", config, OBS, ACTION, 2)
     floor = Floor(update)
     floor.update()

@@ -16,7 +16,7 @@ FORMATS = ("md", "csv", "tex")
 MISSING = "–"
 
 
-class Cell(NamedTuple):
+class TableCell(NamedTuple):
     lines: tuple[str, ...]
     """The first is the value; the others belong below it or, on one line, after it."""
     bold: bool = False
@@ -34,7 +34,7 @@ class Table:
     header: list[str]
     labels: int
     """How many of the leading columns name the row; they are set flush left."""
-    sections: list[list[list[Cell]]]
+    sections: list[list[list[TableCell]]]
     """Rows of cells; a rule separates the sections."""
     records: list[dict[str, Any]]
     """The same content in full, one record a cell or row, for CSV."""
@@ -42,8 +42,8 @@ class Table:
     """LaTeX headings above so many of the columns each, from the first after the labels on."""
 
 
-def text_cells(*texts: str) -> list[Cell]:
-    return [Cell((text,), missing=text == MISSING) for text in texts]
+def text_cells(*texts: str) -> list[TableCell]:
+    return [TableCell((text,), missing=text == MISSING) for text in texts]
 
 
 def to_terminal(table: Table, bold: bool, width: int | None) -> str:
@@ -84,7 +84,7 @@ def to_terminal(table: Table, bold: bool, width: int | None) -> str:
 
 
 def to_markdown(table: Table) -> str:
-    def cell(content: Cell) -> str:
+    def cell(content: TableCell) -> str:
         value, *rest = content.lines
         return " ".join([f"**{value}**" if content.bold else value, *rest])
 
@@ -122,7 +122,7 @@ def to_latex(table: Table) -> str:
     return "\n".join([f"% {table.title}", *preamble, *body, r"\end{document}"]) + "\n"
 
 
-def _latex_row(row: Sequence[Cell]) -> list[str]:
+def _latex_row(row: Sequence[TableCell]) -> list[str]:
     # Equal neighbours that merge are one cell; any other is a group of its own.
     merged = [list(group) for _, group in groupby(enumerate(row), lambda item: item[1] if item[1].merge else item[0])]
     lines = []

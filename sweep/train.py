@@ -1,0 +1,232 @@
+"""Training cells: resume or start the seeds of each that have not ended, and report the results."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import envs
+from algos import ALGORITHMS, setting_keys
+from core.config import RUN_KEYS, Config, saved_settings
+from core.trainer import Trainer
+from core.words import ConfigError, parse_words
+from envs import TASKS, TOLERANCE
+from store.checkpoint import Checkpoint, CheckpointFolder, group_checkpoints
+from store.files import one_line
+from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
+from store.interrupt import Interrupted
+from store.lock import run_lock
+from store.provenance import describe_environment
+from sweep.cells import Cell, make_cells
+from sweep.exit import Exit
+
+
+def train_words(words: str) -> bool:
+    """Train the cells that `words` ask for, as `python run.py <words>` does, in this process.
+
+    Returns whether every seed has a result; a seed that diverged has none. Raises ConfigError for wrong words,
+    ConstraintError for a constraint that breaks down and LockedError if another process trains a run.
+    """
+    return train_cells(make_cells(parse_words(words.split(), setting_keys()))) is Exit.DONE
+
+
+def train_cells(cells: Sequence[Cell], stop_if_asked: Callable[[], None] = lambda: None) -> Exit:
+    """Train `cells` one after the other. `stop_if_asked` raises Interrupted to end the training with a checkpoint."""
+    done = [train(cell, stop_if_asked) for cell in cells]
+    return Exit.DONE if all(done) else Exit.DIVERGED
+
+
+def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
+    """Train the seeds of one cell that have not ended, from their checkpoints where there are any.
+
+    Prints each result and its folder. Returns whether every seed has a result.
+    """
+    config, folders = cell.config, dict(zip(cell.seeds, cell.folders, strict=True))
+    torch.set_num_threads(config.threads)
+    check_device(config.device)  # only here: the machine that submits a job need not have a GPU
+    if config.device.startswith("cuda:"):
+        torch.cuda.set_device(config.device)
+    check_constraint(config.env)
+    torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
+    if config.steps <= config.learning_starts:
+        print(
+            f"note: steps={config.steps} is not more than learning_starts={config.learning_starts}: nothing is learned",
+            file=sys.stderr,
+        )
+    with ExitStack() as locks:
+        for folder in folders.values():
+            locks.enter_context(run_lock(folder))
+        ended = {seed for seed, folder in folders.items() if has_ended(folder) and not config.overwrite}
+        for seed in sorted(ended):
+            print(f"{folders[seed]}: {_end_of(folders[seed])} (overwrite=true starts it again and keeps this one)")
+        groups, fresh = ([], list(folders)) if config.overwrite else _find_checkpoints(folders, ended)
+        info = describe_environment(["run.py", *cell.words])
+        info |= {"threads": config.threads, "device": _device_name(config.device)}
+        for group in groups:
+            if ended.issuperset(group):  # the process died after the last seed's end
+                for seed in group:
+                    CheckpointFolder(folders[seed]).remove()
+            else:
+                _resume(config, folders, group, ended, info, stop_if_asked)
+        if fresh:
+            info["lockstep"] = fresh
+            writers = [
+                RunWriter(
+                    folders[seed],
+                    saved_settings(config, seed),
+                    info,
+                    config.eval_episodes,
+                    replace_finished=config.overwrite,
+                )
+                for seed in fresh
+            ]
+            _run(make_trainer(config, fresh, writers, True, stop_if_asked))
+        return not any(has_failed(folder) for folder in folders.values())
+
+
+def make_trainer(
+    config: Config,
+    seeds: Sequence[int],
+    writers: Sequence[RunWriter],
+    progress: bool = True,
+    stop_if_asked: Callable[[], None] = lambda: None,
+) -> Trainer:
+    """The trainer of one cell, with its environments and its agent; one writer for each seed.
+
+    Raises ConfigError if the networks and the replay buffer do not fit into memory.
+    """
+    make_env = partial(envs.make, config.env)
+    train_envs = [make_env() for _ in seeds]
+    obs_dim = train_envs[0].observation_space.shape[0]
+    try:
+        agent = ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, list(seeds))
+        return Trainer(config, agent, train_envs, make_env, writers, progress, stop_if_asked)
+    except RuntimeError as error:
+        if not any(words in str(error) for words in ("allocate memory", "out of memory")):
+            raise
+        raise ConfigError(
+            f"not enough memory for {len(seeds)} seeds with hidden={config.hidden}, buffer_size={config.buffer_size}"
+        ) from error
+
+
+def check_device(name: str) -> None:
+    """Raise ConfigError if PyTorch cannot compute on the device `name`."""
+    choices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    choices += [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    if name not in choices:
+        hint = "" if len(choices) > 1 else "; PyTorch sees no CUDA GPU here"
+        raise ConfigError(f"bad value {name!r} for device{hint} (choices: {', '.join(choices)})")
+
+
+def check_constraint(task: str) -> None:
+    """Raise ConfigError if the constraint of `task` does not work on its robot."""
+    constraint = TASKS[task].constraint
+    env = envs.make(task)
+    try:
+        obs = torch.from_numpy(env.reset(seed=0)[0]).float().unsqueeze(0)
+        if constraint.dim != env.robot.action_dim:
+            raise ValueError(f"it is for {constraint.dim} action coordinates, the robot has {env.robot.action_dim}")
+        action = constraint.project(obs, torch.ones(1, constraint.dim))
+        if action.shape != (1, constraint.dim) or not constraint.violation(obs, action).item() <= TOLERANCE:
+            raise ValueError(f"it projects (1, ..., 1) to {action.tolist()} at a first observation")
+    except Exception as error:  # the constraint may be the user's own code
+        raise ConfigError(f"the constraint of {task} does not work: {one_line(error)}") from error
+    finally:
+        env.close()
+
+
+def _device_name(device: str) -> str:
+    """The name of `device` in info.json."""
+    return device if device == "cpu" else torch.cuda.get_device_name(device)
+
+
+def _find_checkpoints(folders: dict[int, Path], ended: set[int]) -> tuple[list[dict[int, Checkpoint]], list[int]]:
+    """Groups of seeds that resume together, each seed with its checkpoint, and the seeds that start anew."""
+    intact, started = {}, {}
+    for seed, folder in folders.items():
+        checkpoints, problems = CheckpointFolder(folder).read()
+        if not checkpoints and seed in ended:  # left by a crash during their deletion
+            CheckpointFolder(folder).remove()
+            continue
+        for problem in problems:
+            print(problem, file=sys.stderr)
+        intact[seed] = checkpoints
+        started[seed] = checkpoints[0].group if checkpoints else lockstep_group(folder)
+    groups, fresh = group_checkpoints(intact, started)
+    return groups, [seed for seed in fresh if seed not in ended]
+
+
+def _resume(
+    config: Config,
+    folders: dict[int, Path],
+    group: dict[int, Checkpoint],
+    ended: set[int],
+    info: dict[str, Any],
+    stop_if_asked: Callable[[], None],
+) -> None:
+    """Resume the training from the checkpoints of `group`, which were written together."""
+    before = next(iter(group.values())).group
+    # Seeds that have ended stay in the batch, which keeps its shape. If other seeds are missing, it changes anyway.
+    seeds = list(before) if set(before) == set(group) else [seed for seed in group if seed not in ended]
+    for seed in seeds:
+        _check_settings(folders[seed], group[seed].settings, saved_settings(config, seed))
+    writers = []
+    for seed in seeds:
+        resumed = info | {"step": group[seed].step, "lockstep": seeds}
+        writers.append(RunWriter.resume(folders[seed], saved_settings(config, seed), resumed, config.eval_episodes))
+        if seed not in ended:
+            print(f"{folders[seed]}: resuming from step {group[seed].step}")
+    if len(seeds) < len(before):
+        print(f"(trained with other seeds before, {len(before)} in all: equal up to rounding to an unbroken run)")
+    trainer = make_trainer(config, seeds, writers, True, stop_if_asked)
+    trainer.restore([group[seed] for seed in seeds])
+    _run(trainer)
+
+
+def _check_settings(folder: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
+    """Raise ConfigError if a setting that decides what is learned differs from the one that the run started with."""
+    for key in now.keys() - set(RUN_KEYS):
+        if before.get(key) != now[key]:
+            raise ConfigError(
+                f"{folder} was started with {key}={before.get(key)}, which is {now[key]}"
+                " now; overwrite=true starts it again and keeps the old one"
+            )
+
+
+def _run(trainer: Trainer) -> None:
+    try:
+        results = trainer.run()
+    except (Interrupted, KeyboardInterrupt):
+        step = max(seed.steps for seed in trainer.seeds)
+        print(
+            f"\ninterrupted at step {step}; the same command resumes (without overwrite=true)"
+            f" (unfinished runs are in {trainer.seeds[0].writer.folder.parent})",
+            file=sys.stderr,
+        )
+        raise
+    for seed, result in zip(trainer.seeds, results, strict=True):
+        folder = seed.writer.folder
+        if result is None:
+            print(f"{folder}: {describe_failure(seed.failure)}", file=sys.stderr)
+        else:
+            print(
+                f"{folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
+                f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e})"
+            )
+
+
+def _end_of(folder: Path) -> str:
+    """How the ended run in `folder` ended, in a few words."""
+    try:
+        run = read_run(folder)
+    except ValueError as error:
+        return f"already finished, but unreadable ({error})"
+    if run.failure:
+        return describe_failure(run.failure)
+    return f"already finished, return {run.result['return_mean']:.2f}"

@@ -1,0 +1,127 @@
+"""What several test modules use: short trainings, their outcomes, and invented runs."""
+
+import json
+
+import numpy as np
+import torch
+
+import plot
+import run
+from algos import setting_keys
+from core.words import parse_words
+from store.folder import RunWriter, find_runs, read_run, run_folder, variant_name
+from store.interrupt import Interrupted
+from sweep.cells import make_cells
+from sweep.train import train as train_cell
+
+run_command = run.main
+"""What `python run.py` does with a list of words; the exit code."""
+
+
+class Breaks:
+    """A `stop_if_asked` that ends the training at the given calls, counted over all resumptions."""
+
+    def __init__(self, *at, error=None):
+        self.calls, self.at = 0, at
+        self.error = error or Interrupted(15)
+
+    def __call__(self):
+        self.calls += 1
+        if self.calls in self.at:
+            raise self.error
+
+
+def cells_of(words):
+    """The cells that the words of a command ask for."""
+    return make_cells(parse_words(words.split() if isinstance(words, str) else words, setting_keys()))
+
+
+def config_of(words):
+    """The configuration of the only cell that the words of a command ask for."""
+    (cell,) = cells_of(words)
+    return cell.config
+
+
+def train(root, words, stop_if_asked=lambda: None):
+    """Train the cell of `words` below `root`; whether every seed has a result."""
+    (cell,) = cells_of(f"{words} results={root}")
+    return train_cell(cell, stop_if_asked)
+
+
+def train_through(root, words, check):
+    """Start the same command again until it comes to its end; the number of times that it was interrupted."""
+    interrupted = 0
+    while True:
+        try:
+            train(root, words, check)
+            return interrupted
+        except type(check.error):
+            interrupted += 1
+
+
+def outcome(root):
+    """Everything that a cell leaves but times, by seed."""
+    return {folder.name: outcome_of(folder) for folder in find_runs(root)}
+
+
+def outcome_of(folder):
+    """The same of one run."""
+    result = read_run(folder).result
+    result.pop("seconds")
+    evaluations = [line.rpartition(",")[0] for line in (folder / "evaluations.csv").read_text().splitlines()]
+    training = folder / "training.csv"
+    return {
+        "result": result,
+        "evaluations": evaluations,
+        "training": training.read_text() if training.exists() else None,
+        "parameters": {name: torch.load(folder / f"{name}.pt", weights_only=True) for name in ("best", "last")},
+        "files": sorted(path.name for path in folder.iterdir()),
+    }
+
+
+def assert_identical(one, other):
+    assert one.keys() == other.keys() and one
+    for seed in one:
+        for what in ("result", "evaluations", "training", "files"):
+            assert one[seed][what] == other[seed][what]
+        for name in ("best", "last"):
+            a, b = (outcomes[seed]["parameters"][name] for outcomes in (one, other))
+            assert a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
+
+
+def assert_never_apart(root):
+    """Wherever seeds 3 and 5 resumed, they did so from the same moment."""
+    for folder in root.glob("*/*/seed=[35]"):
+        info = json.loads((folder / "info.json").read_text())
+        assert all(start["lockstep"] == [3, 5] for start in [info, *info.get("resumed", [])])
+
+
+def refused_by_plot(capsys, *arguments):
+    """The one line with which plot.py refuses `arguments`."""
+    assert plot.main([str(argument) for argument in arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert "Traceback" not in captured.err
+    return captured.err
+
+
+def write_run(root, task, algo, seed, result=None, overrides=None, evaluations=4, base=0.0, **config):
+    """A run with `evaluations` evaluations, finished with the mean return `result` unless that is None."""
+    overrides = overrides or {}
+    folder = run_folder(root, task, variant_name(algo, overrides), seed)
+    settings = {
+        "algo": algo,
+        "env": task,
+        "seed": str(seed),
+        "steps": 20_000,
+        "gamma": 0.99,
+        **overrides,
+        **config,
+    }
+    writer = RunWriter(folder, settings, {"commit": None}, eval_episodes=3)
+    rng = np.random.default_rng(seed)
+    for step in range(5_000, 5_000 * evaluations + 1, 5_000):
+        writer.append_evaluation(step, base + step / 1_000 + rng.normal(size=3), step / 100)
+    if result is not None:
+        writer.finish({"return_mean": result, "returns": [result] * 50})
+    return writer

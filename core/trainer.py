@@ -17,13 +17,12 @@ import torch
 from core.agent import Agent
 from core.config import Config
 from core.cuda_graph import GradientSteps
-from core.evaluation import Evaluator
+from core.evaluation import Evaluator, StepTogether
 from core.moments import Moments
 from core.progress import PhaseTimer, Progress
 from core.random import stream_seed
 from core.replay import Batch, Replay
 from core.seed import Best, Seed
-from envs import InfeasibleActionError, step_together
 from store.checkpoint import Checkpoint
 from store.files import one_line
 from store.folder import RunWriter
@@ -42,14 +41,16 @@ class Trainer:
         agent: Agent,
         envs: Sequence[Any],
         make_env: Callable[[], gymnasium.Env],
+        step_together: StepTogether,
         writers: Sequence[RunWriter],
         progress: bool = True,
         stop_if_asked: Callable[[], None] = lambda: None,
     ):
-        self.config, self.agent, self.stop_if_asked = config, agent, stop_if_asked
+        self.config, self.agent = config, agent
+        self.step_together, self.stop_if_asked = step_together, stop_if_asked
         rows = zip(agent.seeds, envs, writers, strict=True)
         self.seeds = [Seed(number, i, env, writer) for i, (number, env, writer) in enumerate(rows)]
-        self.evaluator = Evaluator(make_env, agent.seeds, config.eval_episodes, stop_if_asked)
+        self.evaluator = Evaluator(make_env, agent.seeds, config.eval_episodes, step_together, stop_if_asked)
         self.replay = Replay(
             agent.seeds,
             min(config.buffer_size, config.steps),
@@ -195,10 +196,10 @@ class Trainer:
                 sound.append(seed)
             else:
                 self._fail(seed, f"action {stored[seed.position].tolist()} is not finite")
-        outcomes = step_together([seed.env for seed in sound], executed[[seed.position for seed in sound]])
+        outcomes = self.step_together([seed.env for seed in sound], executed[[seed.position for seed in sound]])
         taken = []
         for seed, outcome in zip(sound, outcomes, strict=True):
-            if isinstance(outcome, InfeasibleActionError):
+            if isinstance(outcome, Exception):
                 self._fail(seed, str(outcome))
             else:
                 taken.append((seed, outcome))

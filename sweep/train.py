@@ -106,7 +106,7 @@ def make_trainer(
     obs_dim = train_envs[0].observation_space.shape[0]
     try:
         agent = ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, list(seeds))
-        return Trainer(config, agent, train_envs, make_env, writers, progress, stop_if_asked)
+        return Trainer(config, agent, train_envs, make_env, envs.step_together, writers, progress, stop_if_asked)
     except RuntimeError as error:
         if not any(words in str(error) for words in ("allocate memory", "out of memory")):
             raise

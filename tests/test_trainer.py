@@ -9,9 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-import core.evaluation
 import core.moments
-import core.trainer
 from algos import ALGORITHMS
 from constraints import WeightedPositivePart
 from core.agent import Agent
@@ -28,13 +26,9 @@ LENGTHS = (5, 7)  # of every other episode; the shorter ones terminate, the long
 CONSTRAINT = WeightedPositivePart(lambda obs: obs[..., :DIM] + 1.0, 0.5, DIM)
 
 
-@pytest.fixture(autouse=True)
-def scripted_steps(monkeypatch):
+def step_together(envs, actions):
     """Scripted environments check no action and step by themselves."""
-    for module in (core.trainer, core.evaluation):
-        monkeypatch.setattr(
-            module, "step_together", lambda envs, actions: [env.step(a) for env, a in zip(envs, actions, strict=True)]
-        )
+    return [env.step(action) for env, action in zip(envs, actions, strict=True)]
 
 
 class Scripted(gymnasium.Env):
@@ -131,6 +125,7 @@ def make_trainer(tmp_path, seeds=(4,), scores=(), agent=None, fail=None, fail_in
         agent,
         [Scripted(fail) for _ in seeds],
         lambda: Scripted(fail_in_evaluation),
+        step_together,
         writers,
         progress=False,
     )

@@ -28,7 +28,7 @@ def usage() -> str:
         "  python run.py algo=paper env=all seed=0-9 launcher=slurm slurm.hours=12    an array of Slurm jobs",
         "  python run.py status results/                      how all cells stand, running, queued or ended",
         "",
-        f"algo: {' '.join(ALGORITHMS)}; paper (the paper's 13) or all",
+        f"algo: {' '.join(ALGORITHMS)}; paper (the paper's own) or all",
         f"env:  {' '.join(TASKS)}; or all",
         "",
         "keys (defaults depend on algorithm and task: the paper's hyperparameter table):",

@@ -1,4 +1,4 @@
-"""Ellipses around the origin, cut by the box: diagonal in any dimension (R+L2) and general in two (R+T)."""
+"""Ellipses around the origin, cut by the box: diagonal in any dimension and general in two (R+T)."""
 
 from __future__ import annotations
 
@@ -6,24 +6,22 @@ import torch
 from torch import Tensor
 
 from constraints.base import Coefficients, Constraint, Ellipse, ExplicitSet
+from constraints.errors import check_bound
 from constraints.jacobian import JacobianProduct, deflated_jacobian
 from constraints.numerics import keep_nan, safe_sqrt
 from constraints.scalar_dual import BoxProblem, RowProblem, minimize_under_ellipse
 
-# A point of the ellipse that is further outside the box than this is not in it.
-_ROUNDING = 1e-13
-# A square below this may be rounding next to 0, and its root a direction in which the ellipse does not end.
-_FLAT = 1e-280
-# Newton needs 3 to 10 steps.
-_MAX_STEPS = 40
+_ROUNDING = 1e-13  # a point outside the box by no more than this is in it
+_FLAT = 1e-280  # a'Qa below this may be the rounding of 0: the ellipse does not end in the direction a
+_MAX_STEPS = 40  # Newton needs 3 to 10
 
 
 class DiagonalEllipse(Constraint):
-    """sum s_i a_i^2 <= bound in the box, s = scale(obs) >= 0; some or all s_i may be 0 (R+L2: s = 1)."""
+    """sum s_i a_i^2 <= bound in the box, s = scale(obs) >= 0; some or all s_i may be 0. ValueError for bound <= 0."""
 
     def __init__(self, scale: Coefficients, bound: float, dim: int):
         super().__init__(dim)
-        _check_bound(bound)
+        check_bound(bound)
         self.scale = scale
         self.bound = bound
 
@@ -51,11 +49,12 @@ class PlanarEllipse(Constraint):
     """a'Qa <= bound in the box, Q = matrix(obs) (..., 2, 2) positive semi-definite; a slab where Q is singular (R+T).
 
     Projection and oracle are exact by cases: the box alone, the ellipse alone, or one of the box's four faces.
+    ValueError for bound <= 0.
     """
 
     def __init__(self, matrix: Coefficients, bound: float):
         super().__init__(2)
-        _check_bound(bound)
+        check_bound(bound)
         self.matrix = matrix
         self.bound = bound
 
@@ -251,8 +250,3 @@ def ellipse_gauge_gradient(
     flat = square < _FLAT
     root = torch.where(flat, 1.0, square).sqrt()
     return torch.where(flat, 0.0, (bent_center + (slope * bent_center + slack * bent_direction) / root) / slack)
-
-
-def _check_bound(bound: float) -> None:
-    if bound <= 0.0:
-        raise ValueError(f"bound must be positive for the origin to be interior, got {bound}")

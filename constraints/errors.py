@@ -1,4 +1,4 @@
-"""The error for a feasible set that is ill-posed, empty or without interior."""
+"""Errors for feasible sets that are ill-posed, empty or without interior."""
 
 from __future__ import annotations
 
@@ -27,6 +27,12 @@ def name_samples(lead: tuple[int, ...]) -> SampleName:
         return f"sample {position[0] if len(position) == 1 else tuple(position)}"
 
     return name
+
+
+def check_bound(bound: float) -> None:
+    """Raise a ValueError for a bound that is not positive."""
+    if bound <= 0.0:
+        raise ValueError(f"bound must be positive for the origin to be interior, got {bound}")
 
 
 def require(valid: Tensor, message: str, name: SampleName) -> None:

@@ -17,10 +17,10 @@ from constraints.density import alpha_boundary_log_density, radial_log_det
 from constraints.gauge import box_gauge_gradient
 from constraints.numerics import one_where_zero, refuse_second_derivatives, with_gradient
 
-_TINY = 1e-150
-# The gauge map's stretch differs from direction to direction, so the gradient of its logarithm grows like 1 / |u|
-# towards u = 0. From this max_i |u_i| inwards it grows no more: a policy comes there once in a million samples (d = 2),
-# and the variance of its gradient would be infinite.
+_TINY = 1e-150  # a gauge in the place of 0
+# The gauge map's factor phi differs from direction to direction, so the gradient of log phi grows like 1 / |u| towards
+# u = 0, and in two dimensions its variance would be infinite. Nearer to 0 than this max_i |u_i| it grows no more; one
+# in a million uniform u is that near.
 _NEAR_CENTER = 1e-3
 
 
@@ -59,7 +59,7 @@ class Ray:
 
     @cached_property
     def _gauge_and_gradient(self) -> tuple[Tensor, Tensor]:
-        # With autograd where the ray was made with it, whoever asks first.
+        # In the autograd mode in which the ray was made, whatever the mode of the first use.
         with torch.set_grad_enabled(self.offset.requires_grad):
             gauge, gradient = self._gauge_of(self.offset)
         return gauge.detach(), gradient
@@ -190,7 +190,7 @@ class Ray:
 
 
 class _Stretch(NamedTuple):
-    """What the gauge map and its density need of the actions u.
+    """Pieces of the gauge map and its density, for actions u.
 
     phi is evaluated at u / max_i |u_i|, where it is 1 / L: it is the same there, and no square underflows.
     """

@@ -59,7 +59,7 @@ class RowProblem:
         return RowSolution(self, torch.lerp(end, start, part.clamp_(max=1.0)), above > self.bound)
 
     def _shares(self, multiplier: Tensor, over_width: Tensor) -> Tensor:
-        """What is left of each coordinate's range (..., k, d) under the multipliers (..., k)."""
+        """The share of its range (..., k, d) that the multipliers (..., k) leave to each coordinate."""
         return (self._from - multiplier.unsqueeze(-1)).div_(over_width).clamp_(0.0, 1.0)
 
 

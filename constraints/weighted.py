@@ -14,18 +14,18 @@ import torch
 from torch import Tensor
 
 from constraints.base import Coefficients, Constraint, ExplicitSet
+from constraints.errors import check_bound
 from constraints.jacobian import JacobianProduct, deflated_jacobian
 from constraints.numerics import one_where_zero, safe_sqrt
 from constraints.scalar_dual import RowProblem
 
 
 class _WeightPatterns(Constraint):
-    """Rows pattern_k * weight(obs), all with the same bound > 0."""
+    """Rows pattern_k * weight(obs), all with the same bound > 0. ValueError for another bound."""
 
     def __init__(self, weight: Coefficients, bound: float, dim: int):
         super().__init__(dim)
-        if bound <= 0.0:
-            raise ValueError(f"bound must be positive for the origin to be interior, got {bound}")
+        check_bound(bound)
         self.weight = weight
         self.bound = bound
 

@@ -113,7 +113,7 @@ RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "device", "threads", 
 """Settings that do not make a run another experiment: they never show in a run's name."""
 
 
-# ---------------------------------------------------------------- overrides
+# ---------------------------------------------------------------- values on the command line
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

@@ -56,7 +56,7 @@ def _rates() -> dict[tuple[str, str], Rate]:
 
 @cache
 def _rate(task: str, algo: str) -> Rate:
-    """The measured rate of a cell; of one that is not measured, the mean over cells of its robot and family."""
+    """The measured rate of a cell. Without one: the mean over cells of the same robot and family of algorithms."""
     if (task, algo) in _rates():
         return _rates()[task, algo]
     family = ALGORITHMS[algo].agent.family

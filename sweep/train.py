@@ -105,8 +105,8 @@ def make_trainer(
     train_envs = [make_env() for _ in seeds]
     obs_dim = train_envs[0].observation_space.shape[0]
     try:
-        agent = ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, seeds)
-        return Trainer(config, agent, train_envs, make_env, writers, progress, stop_if_asked)
+        agent = ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, list(seeds))
+        return Trainer(config, agent, train_envs, make_env, envs.step_together, writers, progress, stop_if_asked)
     except RuntimeError as error:
         if not any(words in str(error) for words in ("allocate memory", "out of memory")):
             raise
@@ -203,18 +203,20 @@ def _run(trainer: Trainer) -> None:
     try:
         results = trainer.run()
     except (Interrupted, KeyboardInterrupt):
+        step = max(seed.steps for seed in trainer.seeds)
         print(
-            f"\ninterrupted at step {max(trainer.steps)}; the same command resumes (without overwrite=true)"
-            f" (unfinished runs are in {trainer.writers[0].folder.parent})",
+            f"\ninterrupted at step {step}; the same command resumes (without overwrite=true)"
+            f" (unfinished runs are in {trainer.seeds[0].writer.folder.parent})",
             file=sys.stderr,
         )
         raise
-    for i, (writer, result) in enumerate(zip(trainer.writers, results, strict=True)):
+    for seed, result in zip(trainer.seeds, results, strict=True):
+        folder = seed.writer.folder
         if result is None:
-            print(f"{writer.folder}: {describe_failure(trainer.failures[i])}", file=sys.stderr)
+            print(f"{folder}: {describe_failure(seed.failure)}", file=sys.stderr)
         else:
             print(
-                f"{writer.folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
+                f"{folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
                 f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e})"
             )
 

@@ -122,7 +122,7 @@ def test_the_papers_hyperparameters():
     """Spot checks of Table "Hyperparameters used in the experiments", through the resolution of cells."""
     cells = {(c.algo, c.env): c for c in configs(["algo=all", "env=all"])}
     assert len(cells) == 13 * len(ALGORITHMS)
-    assert [c.algo for c in configs(["algo=paper", "env=R+N"])] == list(PAPER) and len(PAPER) == 13
+    assert [config.algo for config in configs(["algo=paper", "env=R+N"])] == list(PAPER) and len(PAPER) == 13
     nfw, srad = cells["NFW", "R+L2"], cells["SRad", "R+L2"]
     assert (nfw.gamma, nfw.batch_size, nfw.buffer_size, nfw.fw_learning_rate) == (0.98, 100, 200_000, 0.05)
     assert (nfw.train_freq, nfw.gradient_steps, nfw.steps, nfw.action_noise) == ("episode", -1, 300_000, 0.1)

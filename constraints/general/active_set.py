@@ -11,6 +11,7 @@ from torch import Tensor
 
 from constraints.errors import ConstraintError, SampleName
 from constraints.general.scaled_sets import EMPTY
+from constraints.numerics import times
 
 # A row depends on the active ones where its part outside their span is shorter than this.
 _DEPENDENT = 1e-9
@@ -44,7 +45,7 @@ def project_on_rows(
         return solution, multipliers
 
     for _ in range(50 * (m + dim)):
-        excess = (rows @ point.unsqueeze(-1)).squeeze(-1) - limits
+        excess = times(rows, point) - limits
         entering = torch.where(pending, entering, excess.argmax(-1))
         over = excess.gather(-1, entering.unsqueeze(-1)).squeeze(-1)
         done = ~pending & (over <= tolerance)
@@ -65,8 +66,8 @@ def project_on_rows(
         basis, triangle = torch.linalg.qr(normals.mT)
         basis = basis * used.unsqueeze(1)
         triangle = torch.where(used.unsqueeze(-1), triangle, torch.eye(dim, dtype=rows.dtype))
-        within = (basis.mT @ normal.unsqueeze(-1)).squeeze(-1)
-        step = normal - (basis @ within.unsqueeze(-1)).squeeze(-1)
+        within = times(basis.mT, normal)
+        step = normal - times(basis, within)
         within = torch.linalg.solve_triangular(triangle, within.unsqueeze(-1), upper=True).squeeze(-1)
         length = step.square().sum(-1)
         dependent = (length <= _DEPENDENT**2) | (used.sum(-1) == dim)
@@ -103,9 +104,9 @@ def project_on_rows(
         index, weight = index.gather(-1, order), weight.gather(-1, order)
         normals = normals.take_along_dim(order.unsqueeze(-1), 1) * (index >= 0).unsqueeze(-1)
         # Steps from far away leave the active rows by their rounding. Return to them.
-        offset = limits.gather(-1, index.clamp(min=0)) - (normals @ point.unsqueeze(-1)).squeeze(-1)
+        offset = limits.gather(-1, index.clamp(min=0)) - times(normals, point)
         offset = torch.where(index >= 0, offset, 0.0).unsqueeze(-1)
         gram = normals @ normals.mT + torch.diag_embed((index < 0).to(rows.dtype))
         back = normals.mT @ torch.linalg.solve_ex(gram, offset)[0]
         point = point + torch.where(pending.unsqueeze(-1), 0.0, back.squeeze(-1).nan_to_num())
-    raise ConstraintError(f"{name(int(sample[0]))}: no active set found; rows may be parallel to rounding")
+    raise ConstraintError(f"{name(int(sample[0]))}: no active set found; rows may be parallel up to rounding")

@@ -1,4 +1,4 @@
-"""What sets of one's own share, and checks of what the user's functions return."""
+"""The base of sets of one's own, and checks of the coefficients that their functions return."""
 
 from __future__ import annotations
 

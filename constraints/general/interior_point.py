@@ -12,7 +12,7 @@ from torch import Tensor
 
 from constraints.numerics import times
 
-_MAX_STEPS = 60  # 10 to 20 are enough in most cases
+_MAX_STEPS = 60  # 6 to 20 are enough in most cases
 _PATIENCE = 8  # steps without progress after which a sample ends
 _RESIDUAL = 100.0  # the residual may be this many times the gap
 _ACCEPTED = 1e3  # a sample that stalls has converged if its error is below this many times the accuracy
@@ -48,7 +48,7 @@ def solve_cone_programs(
     def cone_part(vector: Tensor) -> Tensor:
         return vector[:, m:].unflatten(1, (k, q))
 
-    # On the central path but for the gradient: every slack times its multiplier is the set's size.
+    # Every slack times its multiplier is the same, as on the central path.
     point = start
     slack = limits - times(stacked, point)
     tail = torch.linalg.vector_norm(cone_part(slack)[..., 1:], dim=-1)
@@ -59,7 +59,7 @@ def solve_cone_programs(
     dual = slack.amax(-1, keepdim=True) * torch.cat((1.0 / slack[:, :m], mirrored.flatten(1)), 1)
     best, best_dual = point.clone(), dual.clone()
     least, improved = torch.full((count,), torch.inf, dtype=rows.dtype), torch.zeros(count, dtype=torch.long)
-    sample = torch.arange(count)  # the samples still at work
+    sample = torch.arange(count)  # unfinished ones
     for number in range(_MAX_STEPS):
         stationary = curvature * point - gradient + times(stacked.mT, dual)
         infeasible = slack + times(stacked, point) - limits

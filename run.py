@@ -6,8 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 
-from algos import ALGORITHMS
-from core.config import Config
+from algos import ALGORITHMS, setting_keys
 from envs import TASKS
 from sweep.cells import make_cells
 from sweep.exit import Exit, exit_code
@@ -34,9 +33,7 @@ def usage() -> str:
         "",
         "keys (defaults depend on algorithm and task: the paper's hyperparameter table):",
     ]
-    for f in fields(Config):
-        if f.name not in ("algo", "env"):
-            lines.append(f"  {f.name:18s} {f.metadata['help']}")
+    lines += [f"  {key:18s} {f.metadata['help']}" for key, f in setting_keys().items() if key not in ("algo", "env")]
     lines += ["", "keys of a sweep (not part of any run's name):"]
     for schema, prefix in ((SweepSettings, ""), (SlurmSettings, SLURM_PREFIX)):
         lines += [f"  {prefix + f.name:18s} {f.metadata['help']}" for f in fields(schema)]

@@ -1,53 +1,96 @@
-"""The 13 algorithms: which class, which feasibility map, where it stands, and whether the penalty is added."""
+"""The table of algorithms: which class, which feasibility map, where it stands, and whether the penalty is added."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields, make_dataclass
+from functools import cached_property
+from typing import Any
 
 from algos.nfwpo import NFWPO
 from algos.sac import SAC
 from algos.td3 import TD3
 from constraints import Constraint
-from core.agent import Agent, MapName, Placement
-from core.config import Config
+from core.agent import Agent
+from core.config import Config, PenaltyConfig, keys_of, restore_settings
+from core.maps import Alpha, Gauge, Map, Placement, Project, Radial
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """One column of the paper's table."""
+    """One column of the table. Raises ValueError, with the reason, for a combination that is not implemented."""
 
     agent: type[Agent]
-    mapping: MapName
+    map: Map
     placement: Placement
     penalty: bool = False
 
-    @property
-    def base(self) -> str:
-        """The base algorithm, which decides the hyperparameters: "TD3" or "SAC"."""
-        return "SAC" if issubclass(self.agent, SAC) else "TD3"
+    def __post_init__(self) -> None:
+        self.agent.check_combination(self.map, self.placement)
+
+    @cached_property
+    def config_class(self) -> type[Config]:
+        """The dataclass of all settings: the agent's, the map's and, with a penalty, its weight."""
+        own, hints = [], typing.get_type_hints(type(self.map))
+        for f in fields(self.map):
+            if self.agent.needs_log_prob or not f.metadata.get("of_density"):
+                own.append((f.name, hints[f.name], field(default=getattr(self.map, f.name), metadata=f.metadata)))
+        bases = (self.agent.config_class, *([PenaltyConfig] if self.penalty else []))
+        return make_dataclass(f"{self.agent.__name__}Config", own, bases=bases)
+
+    def paper_config(self, name: str, task: str, group: str, steps: int) -> Config:
+        """The settings of the paper's table for a `group` of robots; "Others" where the algorithm has no such row."""
+        paper = self.agent.paper
+        return self.config_class(algo=name, env=task, steps=steps, **paper.get(group, paper["Others"]))
 
     def build(self, config: Config, constraint: Constraint, obs_dim: int, seeds: Sequence[int]) -> Agent:
         """A new agent that trains `seeds` in lockstep."""
-        return self.agent(config, constraint, obs_dim, seeds, mapping=self.mapping, placement=self.placement)
+        return self.agent(config, constraint, obs_dim, seeds, map=self.map, placement=self.placement)
 
 
 ALGORITHMS: dict[str, Algorithm] = {
-    "DPro": Algorithm(TD3, "project", "rollout"),
-    "DPro+": Algorithm(TD3, "project", "rollout", penalty=True),
-    "DPre": Algorithm(TD3, "project", "environment"),
-    "DPre+": Algorithm(TD3, "project", "environment", penalty=True),
-    "DOpt": Algorithm(TD3, "project", "layer"),
-    "DOpt+": Algorithm(TD3, "project", "layer", penalty=True),
-    "NFW": Algorithm(NFWPO, "project", "rollout"),
-    "DAlpha": Algorithm(TD3, "alpha", "layer"),
-    "DRad": Algorithm(TD3, "radial", "layer"),
-    "SPre": Algorithm(SAC, "project", "environment"),
-    "SPre+": Algorithm(SAC, "project", "environment", penalty=True),
-    "SAlpha": Algorithm(SAC, "alpha", "layer"),
-    "SRad": Algorithm(SAC, "radial", "layer"),
+    "DPro": Algorithm(TD3, Project(), "rollout"),
+    "DPro+": Algorithm(TD3, Project(), "rollout", penalty=True),
+    "DPre": Algorithm(TD3, Project(), "environment"),
+    "DPre+": Algorithm(TD3, Project(), "environment", penalty=True),
+    "DOpt": Algorithm(TD3, Project(), "layer"),
+    "DOpt+": Algorithm(TD3, Project(), "layer", penalty=True),
+    "NFW": Algorithm(NFWPO, Project(), "rollout"),
+    "DAlpha": Algorithm(TD3, Alpha(), "layer"),
+    "DRad": Algorithm(TD3, Radial(), "layer"),
+    "SPre": Algorithm(SAC, Project(), "environment"),
+    "SPre+": Algorithm(SAC, Project(), "environment", penalty=True),
+    "SAlpha": Algorithm(SAC, Alpha(), "layer"),
+    "SRad": Algorithm(SAC, Radial(), "layer"),
 }
-"""The paper's 13 names, in the order of its table."""
+"""All names. The paper's 13 come first, in the order of its table."""
 
 PAPER = tuple(ALGORITHMS)
-"""The names of the paper's own algorithms, which `algo=paper` stands for."""
+"""The names of the paper."""
+
+ALGORITHMS |= {
+    "DGauge": Algorithm(TD3, Gauge(), "layer"),
+    "SGauge": Algorithm(SAC, Gauge(), "layer"),
+}
+
+
+def paper_settings(name: str, task: str, robot: Any, steps: int) -> Config:
+    """The paper's configuration of the algorithm `name` on a task of `steps` environment steps.
+
+    `robot.hyperparameters` names its group in the paper's table.
+    """
+    return ALGORITHMS[name].paper_config(name, task, robot.hyperparameters, steps)
+
+
+def setting_keys() -> dict[str, Field]:
+    """Every key of the command line, with the field that describes it: first those that all algorithms have."""
+    keys = keys_of(Config)
+    for algorithm in ALGORITHMS.values():
+        keys |= {key: f for key, f in keys_of(algorithm.config_class).items() if key not in keys}
+    return keys
+
+
+def saved_config(settings: Mapping[str, Any]) -> Config:
+    """The configuration in a run's config.yaml, whose algorithm must be one of `ALGORITHMS`."""
+    return restore_settings(ALGORITHMS[settings["algo"]].config_class, settings)

@@ -6,15 +6,34 @@ through the projection; it is drawn to a reference action that a Frank-Wolfe ste
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
-from algos.td3 import TD3
+from algos.td3 import TD3, TD3Config
+from core.config import POSITIVE_SHARE, setting
+from core.maps import Project
 from core.replay import Batch
+
+
+@dataclass
+class NFWPOConfig(TD3Config):
+    fw_learning_rate: float = setting(0.01, "NFW: Frank-Wolfe step", POSITIVE_SHARE)
 
 
 class NFWPO(TD3):
     """TD3 whose actor regresses on Frank-Wolfe reference actions."""
+
+    config: NFWPOConfig
+    config_class = NFWPOConfig
+    maps = (Project,)
+    placements = ("rollout",)
+    paper = {
+        "Reacher": TD3.paper["Reacher"] | {"fw_learning_rate": 0.05},
+        "Hopper": TD3.paper["Hopper"] | {"fw_learning_rate": 0.01},
+        "Others": TD3.paper["Others"] | {"fw_learning_rate": 0.01},
+    }
 
     def actor_loss(self, batch: Batch) -> Tensor:
         """|mu(s) - a_s|^2, no gradient through a_s, mean over the batch: (seeds,)."""

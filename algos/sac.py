@@ -1,45 +1,50 @@
-"""SAC under action constraints: SPre, SPre+, SAlpha and SRad.
+"""SAC under action constraints: SPre, SPre+, SAlpha, SRad and SGauge.
 
 Haarnoja et al. (2018) with a learned temperature and a feasibility map (paper, Section "Incorporating Action
-Constraints to SAC"). The actor's Gaussian is squashed by tanh before the environment projects (SPre), or mapped into
-the feasible set by the alpha or radial map, whose log-densities `constraints` gives in closed form. On Reacher the
-exploration noise is state-dependent (gSDE, Raffin et al. 2022).
+Constraints to SAC"). The actor's Gaussian is squashed by tanh where the map says so, and the critic sees the result
+(SPre, whose environment projects) or what the map makes of it, with the map's log-density (`core.maps`). On Reacher
+the exploration noise is state-dependent (gSDE, Raffin et al. 2022).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 from torch.optim import Optimizer
 
-from constraints import Constraint
-from core.agent import Agent, MapName, Placement
-from core.config import Config
+from core.agent import Agent
+from core.config import Config, setting
+from core.maps import Sample
 from core.networks import MLP, Adam, TwinCritic, frozen_copy, rows_of, soft_update
-from core.random import Streams
 from core.replay import Batch
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 
 
-class Sample(NamedTuple):
-    """Actions before any map, drawn from N(mean, diag std^2), each (seeds, batch, d)."""
+@dataclass
+class SACConfig(Config):
+    """SAC's own setting."""
 
-    raw: Tensor
-    mean: Tensor
-    std: Tensor
-    log_prob: Tensor  # (seeds, batch): of raw
+    gsde: bool = setting(False, "SAC: state-dependent exploration")
 
 
 def normal_log_prob(residual: Tensor, log_std: Tensor) -> Tensor:
     """Log-density (...) of independent normals (..., d), `residual` standard deviations from their means."""
     constant = 0.5 * math.log(2 * math.pi) * log_std.shape[-1]
     return -(log_std + 0.5 * residual.square()).sum(-1) - constant
+
+
+def squashed(sample: Sample) -> Sample:
+    """The sample after a tanh."""
+    raw = sample.suggested
+    # log tanh' = 2 (log 2 - raw - softplus(-2 raw)), exact however far out.
+    log_slope = -2 * (raw + softplus(-2 * raw)).sum(-1) + 2 * math.log(2) * raw.shape[-1]
+    return sample._replace(suggested=raw.tanh(), log_prob=sample.log_prob - log_slope)
 
 
 class GaussianActor(nn.Module):
@@ -56,7 +61,7 @@ class GaussianActor(nn.Module):
         return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
 
     def sample(self, obs: Tensor, noise: Tensor) -> Sample:
-        """A reparametrised sample; `noise` standard normal (seeds, batch, d)."""
+        """A reparametrised sample, before any tanh; `noise` is standard normal (seeds, batch, d)."""
         mean, log_std = self(obs)
         std = log_std.exp()
         return Sample(mean + std * noise, mean, std, normal_log_prob(noise, log_std))
@@ -86,7 +91,7 @@ class StateDependentActor(nn.Module):
         return self.mean(latent).clamp(-self.MEAN_BOUND, self.MEAN_BOUND), latent
 
     def sample(self, obs: Tensor, noise: Tensor) -> Sample:
-        """A reparametrised sample; `noise` standard normal (seeds, latent, d)."""
+        """A reparametrised sample, before any tanh; `noise` is standard normal (seeds, latent, d)."""
         mean, latent = self(obs)
         theta_std = self.log_std.exp()
         std = (latent.square() @ theta_std.square() + self.VARIANCE_FLOOR).sqrt()
@@ -97,30 +102,42 @@ class StateDependentActor(nn.Module):
 class SAC(Agent):
     """Soft actor-critic for all seeds at once; tensors are (seeds, batch, features)."""
 
-    def __init__(
-        self,
-        config: Config,
-        constraint: Constraint,
-        obs_dim: int,
-        seeds: Sequence[int],
-        *,
-        mapping: MapName,
-        placement: Placement,
-    ):
-        super().__init__(config, constraint, obs_dim, seeds, mapping=mapping, placement=placement)
-        init = Streams(seeds, "init").generators
+    config: SACConfig
+    config_class = SACConfig
+    family = "SAC"
+    placements = ("environment", "layer")
+    needs_log_prob = True
+    paper = {
+        "Reacher": {
+            "gamma": 0.98, "hidden": [400, 300], "batch_size": 256, "learning_rate": 7.3e-4,
+            "buffer_size": 300_000, "tau": 0.02, "gsde": True,
+            "learning_starts": 100_000, "train_freq": 8, "gradient_steps": 8,
+        },
+        "Hopper": {
+            "gamma": 0.99, "hidden": [256, 256], "batch_size": 256, "learning_rate": 3e-4,
+            "buffer_size": 1_000_000, "tau": 0.005, "gsde": False,
+            "learning_starts": 100_000, "train_freq": 1, "gradient_steps": 1,
+        },
+        "Others": {
+            "gamma": 0.99, "hidden": [256, 256], "batch_size": 256, "learning_rate": 3e-4,
+            "buffer_size": 1_000_000, "tau": 0.005, "gsde": False,
+            "learning_starts": 100_000, "train_freq": 1, "gradient_steps": 1,
+        },
+    }  # fmt: skip
+
+    def build(self, init: Sequence[torch.Generator]) -> None:
+        config, seeds = self.config, len(self.seeds)
         actor_class = StateDependentActor if config.gsde else GaussianActor
-        self.actor = actor_class(obs_dim, self.action_dim, config.hidden, init).to(self.device)
-        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init).to(self.device)
+        self.actor = actor_class(self.obs_dim, self.action_dim, config.hidden, init).to(self.device)
+        self.critic = TwinCritic(self.obs_dim, self.action_dim, config.hidden, init).to(self.device)
         self.critic_target = frozen_copy(self.critic)
-        self.temperature = Temperature(len(seeds)).to(self.device)
+        self.temperature = Temperature(seeds).to(self.device)
         self.actor_optimizer = Adam(self.actor.parameters(), config.learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), config.learning_rate)
         self.temperature_optimizer = Adam(self.temperature.parameters(), config.learning_rate)
         self.target_entropy = -float(self.action_dim)
-        self.unit_ball = config.entropy == "ball"
-        self.rollout_noise = torch.zeros(len(seeds), *self.actor.noise_shape, device=self.device)
-        self.entropy = torch.zeros(len(seeds), 1, device=self.device)  # of the policy at the last batch's states
+        self.rollout_noise = torch.zeros(seeds, *self.actor.noise_shape, device=self.device)
+        self.entropy = torch.zeros(seeds, 1, device=self.device)  # of the policy at the last batch's states
 
     def networks(self) -> dict[str, nn.Module]:
         return {
@@ -140,24 +157,20 @@ class SAC(Agent):
     def memory(self) -> dict[str, Tensor]:
         return {"rollout_noise": self.rollout_noise, "entropy": self.entropy}
 
-    def start_rollout(self, only: Sequence[int]) -> None:
+    def start_rollout(self, which: Sequence[int]) -> None:
         """gSDE keeps one theta for a rollout."""
         if self.config.gsde:
-            fresh = self.exploration.normal(*self.actor.noise_shape, only=only)
-            for i in only:
+            fresh = self.exploration.normal(*self.actor.noise_shape, which=which)
+            for i in which:
                 self.rollout_noise[i] = fresh[i]
 
     @torch.no_grad()
-    def explore(self, obs: Tensor, only: Sequence[int]) -> Tensor:
+    def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
         if self.config.gsde:
             noise = self.rollout_noise
         else:
-            noise = self.exploration.normal(*self.actor.noise_shape, only=only).unsqueeze(1)
-        return self.suggest(self.actor.sample(obs.unsqueeze(1), noise).raw.squeeze(1))
-
-    def suggest(self, raw: Tensor) -> Tensor:
-        """The action before the map, in the box where a projection follows."""
-        return raw.tanh() if self.bounded else raw
+            noise = self.exploration.normal(*self.actor.noise_shape, which=which).unsqueeze(1)
+        return self.squash(self.actor.sample(obs.unsqueeze(1), noise).suggested.squeeze(1))
 
     def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:
         actor = rows_of(self.actor, which)
@@ -165,25 +178,19 @@ class SAC(Agent):
         @torch.no_grad()
         def act(obs: Tensor) -> Tensor:
             mean, _ = actor(obs)
-            return self.feasible(obs, self.suggest(mean), None)
+            return self.feasible(obs, self.squash(mean), None)
 
         return act
 
     def sample(self, obs: Tensor, center: Tensor | None, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """An action as the critic sees it, its log-density (seeds, batch), and the suggestion before the map."""
-        raw, mean, std, log_prob = self.actor.sample(obs, noise)
-        if self.mapping == "alpha":
-            ray = self.constraint.ray(obs, raw, center)
-            log_prob = ray.alpha_log_prob(mean, std, self.unit_ball, self.config.boundary_weight)
-            return ray.alpha_map(), log_prob, raw
-        if self.mapping == "radial":
-            ray = self.constraint.ray(obs, raw, center)
-            log_prob = ray.radial_log_prob(log_prob, self.unit_ball, self.config.log_det_floor)
-            return ray.radial_map(), log_prob, raw
-        # log tanh' = 2 (log 2 - raw - softplus(-2 raw)), exact however far out.
-        log_slope = -2 * (raw + softplus(-2 * raw)).sum(-1) + 2 * math.log(2) * raw.shape[-1]
-        suggested = self.suggest(raw)
-        return suggested, log_prob - log_slope, suggested
+        sample = self.actor.sample(obs, noise)
+        if self.map.squashes:
+            sample = squashed(sample)
+        if self.placement == "environment":
+            return sample.suggested, sample.log_prob, sample.suggested
+        action, log_prob = self.map.with_log_prob(self.constraint, obs, sample, center)
+        return action, log_prob, sample.suggested
 
     def update(self, batch: Batch) -> None:
         """One step of temperature, critics and actor, in this order."""

@@ -1,4 +1,4 @@
-"""TD3 under action constraints: DPro, DPre, DOpt, DAlpha, DRad and their + variants.
+"""TD3 under action constraints: DPro, DPre, DOpt, DAlpha, DRad, DGauge and their + variants.
 
 Fujimoto et al. (2018) with a feasibility map P_s between the actor mu and the critics (paper, Sections "Algorithms
 Based on the Closest Point Projection" and "Other Mapping Techniques"). The names differ only in which map, where it
@@ -8,39 +8,59 @@ stands (`core.agent.Agent`) and whether the penalty for infeasible suggestions j
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from constraints import Constraint
-from core.agent import Agent, MapName, Placement
-from core.config import Config
+from core.agent import Agent
+from core.config import AT_LEAST_ONE, NOT_NEGATIVE, Config, setting
 from core.networks import MLP, Adam, TwinCritic, frozen_copy, rows_of, soft_update
-from core.random import Streams
 from core.replay import Batch
+
+
+@dataclass
+class TD3Config(Config):
+    """TD3's own settings. All but the first are constants that the paper takes from Fujimoto et al."""
+
+    action_noise: float = setting(0.1, "TD3, NFW: std of exploration noise", NOT_NEGATIVE)
+    policy_delay: int = setting(2, "TD3, NFW: critic steps an actor step", AT_LEAST_ONE)
+    target_noise: float = setting(0.2, "TD3, NFW: std of target smoothing", NOT_NEGATIVE)
+    target_noise_clip: float = setting(0.5, "TD3, NFW: bound of that noise", NOT_NEGATIVE)
 
 
 class TD3(Agent):
     """Twin delayed DDPG for all seeds at once; tensors are (seeds, batch, features)."""
 
-    def __init__(
-        self,
-        config: Config,
-        constraint: Constraint,
-        obs_dim: int,
-        seeds: Sequence[int],
-        *,
-        mapping: MapName,
-        placement: Placement,
-    ):
-        super().__init__(config, constraint, obs_dim, seeds, mapping=mapping, placement=placement)
-        init = Streams(seeds, "init").generators
-        self.actor = MLP([obs_dim, *config.hidden, self.action_dim], init).to(self.device)
-        self.critic = TwinCritic(obs_dim, self.action_dim, config.hidden, init).to(self.device)
+    config: TD3Config
+    config_class = TD3Config
+    family = "TD3"
+    paper = {
+        "Reacher": {
+            "gamma": 0.98, "hidden": [400, 300], "batch_size": 100, "learning_rate": 1e-3,
+            "buffer_size": 200_000, "tau": 0.005, "action_noise": 0.1,
+            "learning_starts": 100_000, "train_freq": "episode", "gradient_steps": -1,
+        },
+        "Hopper": {
+            "gamma": 0.99, "hidden": [400, 300], "batch_size": 256, "learning_rate": 3e-4,
+            "buffer_size": 1_000_000, "tau": 0.005, "action_noise": 0.1,
+            "learning_starts": 100_000, "train_freq": 1, "gradient_steps": 1,
+        },
+        "Others": {
+            "gamma": 0.99, "hidden": [400, 300], "batch_size": 100, "learning_rate": 1e-3,
+            "buffer_size": 1_000_000, "tau": 0.005, "action_noise": 0.1,
+            "learning_starts": 100_000, "train_freq": "episode", "gradient_steps": -1,
+        },
+    }  # fmt: skip
+
+    def build(self, init: Sequence[torch.Generator]) -> None:
+        hidden, learning_rate = self.config.hidden, self.config.learning_rate
+        self.actor = MLP([self.obs_dim, *hidden, self.action_dim], init).to(self.device)
+        self.critic = TwinCritic(self.obs_dim, self.action_dim, hidden, init).to(self.device)
         self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
-        self.actor_optimizer = Adam(self.actor.parameters(), config.learning_rate)
-        self.critic_optimizer = Adam(self.critic.parameters(), config.learning_rate)
+        self.actor_optimizer = Adam(self.actor.parameters(), learning_rate)
+        self.critic_optimizer = Adam(self.critic.parameters(), learning_rate)
 
     def networks(self) -> dict[str, nn.Module]:
         return {
@@ -58,14 +78,14 @@ class TD3(Agent):
         return self.config.policy_delay
 
     def suggest(self, actor: MLP, obs: Tensor) -> Tensor:
-        """mu(s): the action before the map, in the box where a projection follows."""
-        return actor(obs).tanh() if self.bounded else actor(obs)
+        """mu(s): the action before the map."""
+        return self.squash(actor(obs))
 
     @torch.no_grad()
-    def explore(self, obs: Tensor, only: Sequence[int]) -> Tensor:
-        noise = self.config.action_noise * self.exploration.normal(self.action_dim, only=only)
+    def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
+        noise = self.config.action_noise * self.exploration.normal(self.action_dim, which=which)
         suggested = self.suggest(self.actor, obs.unsqueeze(1)).squeeze(1) + noise
-        return suggested.clamp(-1.0, 1.0) if self.bounded else suggested
+        return suggested.clamp(-1.0, 1.0) if self.map.squashes else suggested
 
     def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:
         actor = rows_of(self.actor, which)
@@ -102,9 +122,7 @@ class TD3(Agent):
             action = self.feasible(batch.next_obs, action, batch.next_center)
         noise = self.update_noise.normal(*action.shape[1:]) * self.config.target_noise
         action = action + noise.clamp(-self.config.target_noise_clip, self.config.target_noise_clip)
-        if self.bounded:
-            return action.clamp(-1.0, 1.0)
-        return self.pull_back(batch.next_obs, action, batch.next_center)
+        return self.map.limit_target(self.constraint, batch.next_obs, action, batch.next_center)
 
     def actor_loss(self, batch: Batch) -> Tensor:
         """-Q_1 at the actor's action plus the penalty, mean over the batch: (seeds,)."""

@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import torch
 
 from core.config import Config, saved_settings
+from core.seed import Best
 from core.words import ConfigError, parse_words, whole_numbers
 from store.checkpoint import CheckpointFolder
 from store.folder import RunWriter
@@ -57,7 +58,7 @@ def measure(config: Config, count: int, folder: Path) -> None:
     trainer.replay.added = [transitions] * count
     update = min(timed(lambda: trainer.agent.update(trainer.replay.sample(config.batch_size))) for _ in range(10))
     for i in seeds:
-        trainer.best[i] = (0.0, 0, trainer.agent.state(i))
+        trainer.seeds[i].best = Best(0.0, 0, trainer.agent.state(i))
 
     before = peak()
     whole = timed(trainer._checkpoint), megabytes(folder)

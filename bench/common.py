@@ -12,7 +12,7 @@ from algos import ALGORITHMS
 from core.agent import Agent
 from core.config import Config
 from core.random import stream_seed
-from core.replay import Replay
+from core.replay import Batch, Replay
 from store.provenance import processor
 from sweep.cells import make_cells
 
@@ -47,12 +47,11 @@ def fill_replay(agent: Agent, transitions: int) -> Replay:
     robots = [envs.make(TASK) for _ in seeds]
     obs = stack([env.reset(seed=stream_seed(seed, "environment"))[0] for env, seed in zip(robots, seeds, strict=True)])
     for _ in range(transitions):
-        suggested = agent.warm_up(everyone).cpu()
-        executed = agent.pull_back(obs, suggested, None)
-        steps = envs.step_together(robots, executed.numpy())
+        action = agent.act(obs, agent.centers(obs), everyone, [])
+        steps = envs.step_together(robots, action.executed.numpy())
         next_obs, reward, terminated = (stack([step[k] for step in steps]) for k in range(3))
-        stored = suggested if agent.placement == "environment" else executed
-        replay.add(everyone, obs, stored, reward[:, None], terminated[:, None], next_obs)
+        centers = agent.centers(obs), agent.centers(next_obs)
+        replay.add(everyone, Batch(obs, action.stored, reward[:, None], terminated[:, None], next_obs, *centers))
         restarts = {
             i: env.reset()[0] for i, (env, step) in enumerate(zip(robots, steps, strict=True)) if any(step[2:4])
         }

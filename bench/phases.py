@@ -123,7 +123,8 @@ def measure_phases(algo: str, seeds: Sequence[int]) -> Phases:
         results = trainer.run()
         total = time.perf_counter() - start
 
-    measured = {phase: trainer.seconds[phase] for phase in ("environment", "map", "checkpoint")}
+    measured = {phase: trainer.timer.phases[phase] for phase in ("environment", "checkpoint")}
+    measured["map"] = trainer.timer.phases["acting"] - watch.seconds("exploration")
     measured |= {phase: watch.seconds(phase) for phase in (*UPDATE, *OUTSIDE) if phase not in measured}
     measured["forward and backward"] = sum(
         sign * watch.seconds(phase) for phase, sign in (("update", 1), ("optimiser", -1), ("target update", -1))

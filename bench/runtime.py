@@ -37,7 +37,7 @@ from tqdm import tqdm
 
 from algos import ALGORITHMS
 from bench.common import TASK, fill_replay, machine_name, make_agent
-from core.graph import GradientSteps
+from core.cuda_graph import GradientSteps
 from core.words import ConfigError, parse_words, split_names, whole_number, whole_numbers
 from plots.runtime import COLUMNS, runtime_table
 from sweep.train import check_device

@@ -106,7 +106,7 @@ def environment_turn(base: str, seeds: int, steps: int) -> Turn:
         times: list[float] = []
 
         def stop_if_asked() -> None:  # the loop calls it between any two steps
-            taken = trainer.steps[0]
+            taken = trainer.seeds[0].steps
             if taken >= 10 and not times:
                 times.append(clock())
             elif taken >= 10 + steps:

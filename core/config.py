@@ -1,12 +1,16 @@
-"""The configuration: one typed dataclass, the paper's hyperparameter table, and the parsing of values."""
+"""Settings: the dataclass of those that every algorithm has, how a field is declared, and the parsing of values.
+
+An algorithm adds its own settings in a subclass of `Config` beside it, and a map in its own fields (`core.maps.Map`).
+"""
 
 from __future__ import annotations
 
 import math
 import re
 import typing
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Mapping
+from dataclasses import Field, dataclass, field, fields
+from typing import Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -19,142 +23,114 @@ THREADS = min(torch.get_num_threads(), 4)
 the networks are small."""
 
 
+# ---------------------------------------------------------------- how a setting is declared
+
+
+class Rule(NamedTuple):
+    """What the value of a setting must satisfy, and the words that say so."""
+
+    holds: Callable[[Any], bool]
+    words: str
+
+
+POSITIVE = Rule(lambda value: value > 0, "must be positive")
+NOT_NEGATIVE = Rule(lambda value: value >= 0, "must not be negative")
+AT_LEAST_ONE = Rule(lambda value: value >= 1, "must be at least 1")
+POSITIVE_SHARE = Rule(lambda value: 0 < value <= 1, "must be in (0, 1]")
+
+
+def one_of(*choices: str) -> Rule:
+    return Rule(lambda value: value in choices, f"must be {' or '.join(map(repr, choices))}")
+
+
+def setting(default: Any, help: str, rule: Rule | None = None, **metadata: Any) -> Any:
+    """A field of a dataclass that is a key of the command line.
+
+    `help` is one line for the usage text. Metadata: `key` is its name on the command line and in config.yaml, where
+    that is not the field's; `of_density` marks a map's setting that only algorithms with a log-density have.
+    """
+    metadata |= {"help": help, "rule": rule}
+    if isinstance(default, list):
+        return field(default_factory=lambda: list(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+def keys_of(schema: Any) -> dict[str, Field]:
+    """The fields of a dataclass by their names on the command line and in config.yaml."""
+    return {f.metadata.get("key", f.name): f for f in fields(schema)}
+
+
+# ---------------------------------------------------------------- the settings of every algorithm
+
+
 @dataclass
 class Config:
-    """Every setting of one run. `None` marks a setting that the chosen algorithm does not have."""
+    """The settings of one run that every algorithm has."""
 
     algo: str
     env: str
-    seed: str = field(default="0", metadata={"help": "seeds trained in lockstep: 3, 0-9 or 1,4,7"})
-    steps: int = field(default=0, metadata={"help": "environment steps of each seed"})
+    seeds: tuple[int, ...] = setting((0,), "seeds trained in lockstep: 3, 0-9 or 1,4,7", key="seed")
+    steps: int = setting(0, "environment steps of each seed", AT_LEAST_ONE)
     # Hyperparameters of the paper's table "Hyperparameters used in the experiments".
-    gamma: float = field(default=0.99, metadata={"help": "discount factor"})
-    hidden: list[int] = field(default_factory=lambda: [400, 300], metadata={"help": "hidden layer widths"})
-    batch_size: int = field(default=100, metadata={"help": "transitions in a gradient step"})
-    learning_rate: float = field(default=1e-3, metadata={"help": "Adam's, for every network"})
-    buffer_size: int = field(default=1_000_000, metadata={"help": "transitions kept for replay, a seed"})
-    tau: float = field(default=0.005, metadata={"help": "target update ratio"})
-    action_noise: float | None = field(default=None, metadata={"help": "TD3, NFW: std of exploration noise"})
-    fw_learning_rate: float | None = field(default=None, metadata={"help": "NFW: Frank-Wolfe step"})
-    learning_starts: int = field(default=100_000, metadata={"help": "random warm-up steps"})
-    gsde: bool | None = field(default=None, metadata={"help": "SAC: state-dependent exploration"})
-    train_freq: str = field(default="1", metadata={"help": "steps in a rollout, or 'episode'"})
-    gradient_steps: int = field(default=1, metadata={"help": "after each rollout; -1: as many as its steps"})
-    # Constants of TD3 and of the penalty term, which the paper takes from their sources.
-    policy_delay: int | None = field(default=None, metadata={"help": "TD3, NFW: critic steps an actor step"})
-    target_noise: float | None = field(default=None, metadata={"help": "TD3, NFW: std of target smoothing"})
-    target_noise_clip: float | None = field(default=None, metadata={"help": "TD3, NFW: bound of that noise"})
-    penalty: float | None = field(default=None, metadata={"help": "names with +: weight of the penalty"})
-    # Choices that the paper leaves open or makes without naming them; its own are the defaults.
-    entropy: str | None = field(
-        default=None,
-        metadata={"help": "SAlpha, SRad: entropy of actions as in the 'paper', or in unit-'ball' coordinates"},
+    gamma: float = setting(0.99, "discount factor", Rule(lambda value: 0 <= value <= 1, "must be in [0, 1]"))
+    hidden: list[int] = setting(
+        [400, 300], "hidden layer widths", Rule(lambda value: min(value) >= 1, "must list positive widths")
     )
-    boundary_weight: float | None = field(
-        default=None, metadata={"help": "SAlpha: weight of the boundary's measure in the entropy"}
+    batch_size: int = setting(100, "transitions in a gradient step", AT_LEAST_ONE)
+    learning_rate: float = setting(1e-3, "Adam's, for every network", POSITIVE)
+    buffer_size: int = setting(1_000_000, "transitions kept for replay, a seed", AT_LEAST_ONE)
+    tau: float = setting(0.005, "target update ratio", POSITIVE_SHARE)
+    learning_starts: int = setting(100_000, "random warm-up steps", NOT_NEGATIVE)
+    train_freq: int | str = setting(
+        1,
+        "steps in a rollout, or 'episode'",
+        Rule(lambda value: value == "episode" or (isinstance(value, int) and value >= 1), "must be steps or 'episode'"),
     )
-    log_det_floor: float | None = field(
-        default=None, metadata={"help": "SRad: added to the determinant in the density (released code: 1e-6)"}
+    gradient_steps: int = setting(
+        1,
+        "after each rollout; -1: as many as its steps",
+        Rule(lambda value: value == -1 or value >= 1, "must be -1 or at least 1"),
     )
     # Protocol.
-    eval_every: int = field(default=5_000, metadata={"help": "environment steps between evaluations"})
-    eval_episodes: int = field(default=5, metadata={"help": "episodes of an evaluation"})
-    final_episodes: int = field(default=50, metadata={"help": "episodes of the final result"})
+    eval_every: int = setting(5_000, "environment steps between evaluations", AT_LEAST_ONE)
+    eval_episodes: int = setting(5, "episodes of an evaluation", AT_LEAST_ONE)
+    final_episodes: int = setting(50, "episodes of the final result", AT_LEAST_ONE)
     # The run itself; none of these changes what is learned, beyond float rounding.
-    results: str = field(default="results", metadata={"help": "folder that results go to"})
-    overwrite: bool = field(default=False, metadata={"help": "start again in any case; the old run is kept"})
-    simulator: str | None = field(
-        default=None, metadata={"help": "Reacher: 'closed-form', or 'pybullet', its reference, where that is installed"}
+    results: str = setting("results", "folder that results go to")
+    overwrite: bool = setting(False, "start again in any case; the old run is kept")
+    simulator: str | None = setting(
+        None, "Reacher: 'closed-form', or 'pybullet', its reference, where that is installed"
     )
-    device: str = field(
-        default="cpu",
-        metadata={"help": "of networks and replay buffer: cpu, cuda or cuda:1"},
+    device: str = setting(
+        "cpu",
+        "of networks and replay buffer: cpu, cuda or cuda:1",
+        # Only the machine that trains can tell whether there is such a GPU.
+        Rule(lambda value: bool(re.fullmatch(r"cpu|cuda(:[0-9]+)?", value)), "must be cpu, cuda or cuda:N"),
     )
-    threads: int = field(
-        default=THREADS, metadata={"help": "CPU threads (default: a cell alone up to 4, in a sweep 1)"}
-    )
-    checkpoint_every: int = field(default=10_000, metadata={"help": "environment steps of a seed between checkpoints"})
+    threads: int = setting(THREADS, "CPU threads (default: a cell alone up to 4, in a sweep 1)", AT_LEAST_ONE)
+    checkpoint_every: int = setting(10_000, "environment steps of a seed between checkpoints", AT_LEAST_ONE)
 
 
-KEYS = tuple(f.name for f in fields(Config))
-"""The keys of a command line that trains."""
+@dataclass
+class PenaltyConfig(Config):
+    """The setting of the names with +."""
+
+    penalty: float = setting(1.0, "names with +: weight of the penalty", NOT_NEGATIVE)
+
 
 RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "simulator", "device", "threads", "checkpoint_every")
 """Settings that do not make a run another experiment: they never show in a run's name."""
 
-TD3_CONSTANTS = {"policy_delay": 2, "target_noise": 0.2, "target_noise_clip": 0.5}
 
-ENTROPY_CHOICES: dict[str, dict] = {  # of SAC, by the map that its density has to follow
-    "alpha": {"entropy": "paper", "boundary_weight": 1.0},
-    "radial": {"entropy": "paper", "log_det_floor": 0.0},
-}
-
-HYPERPARAMETERS: dict[tuple[str, str], dict] = {
-    # (robot, base algorithm): the paper's Table "Hyperparameters used in the experiments".
-    ("Reacher", "TD3"): {
-        "gamma": 0.98, "hidden": [400, 300], "batch_size": 100, "learning_rate": 1e-3,
-        "buffer_size": 200_000, "tau": 0.005, "action_noise": 0.1, "fw_learning_rate": 0.05,
-        "learning_starts": 100_000, "train_freq": "episode", "gradient_steps": -1,
-    },
-    ("Reacher", "SAC"): {
-        "gamma": 0.98, "hidden": [400, 300], "batch_size": 256, "learning_rate": 7.3e-4,
-        "buffer_size": 300_000, "tau": 0.02, "gsde": True,
-        "learning_starts": 100_000, "train_freq": "8", "gradient_steps": 8,
-    },
-    ("Hopper", "TD3"): {
-        "gamma": 0.99, "hidden": [400, 300], "batch_size": 256, "learning_rate": 3e-4,
-        "buffer_size": 1_000_000, "tau": 0.005, "action_noise": 0.1, "fw_learning_rate": 0.01,
-        "learning_starts": 100_000, "train_freq": "1", "gradient_steps": 1,
-    },
-    ("Hopper", "SAC"): {
-        "gamma": 0.99, "hidden": [256, 256], "batch_size": 256, "learning_rate": 3e-4,
-        "buffer_size": 1_000_000, "tau": 0.005, "gsde": False,
-        "learning_starts": 100_000, "train_freq": "1", "gradient_steps": 1,
-    },
-    ("Others", "TD3"): {
-        "gamma": 0.99, "hidden": [400, 300], "batch_size": 100, "learning_rate": 1e-3,
-        "buffer_size": 1_000_000, "tau": 0.005, "action_noise": 0.1, "fw_learning_rate": 0.01,
-        "learning_starts": 100_000, "train_freq": "episode", "gradient_steps": -1,
-    },
-    ("Others", "SAC"): {
-        "gamma": 0.99, "hidden": [256, 256], "batch_size": 256, "learning_rate": 3e-4,
-        "buffer_size": 1_000_000, "tau": 0.005, "gsde": False,
-        "learning_starts": 100_000, "train_freq": "1", "gradient_steps": 1,
-    },
-}  # fmt: skip
+def keys_that_apply(config: Config) -> list[str]:
+    """The keys that a user can set for the cell of `config`. Where there is no choice, the value is None."""
+    return [key for key, f in keys_of(config).items() if getattr(config, f.name) is not None]
 
 
-def defaults(
-    algo: str,
-    env: str,
-    robot: str,
-    base: str,
-    mapping: str,
-    frank_wolfe: bool,
-    penalty: bool,
-    steps: int,
-    simulator: str | None = None,
-) -> Config:
-    """The paper's configuration of one cell.
-
-    `robot` is the task's robot, `base` is "TD3" or "SAC", `mapping` the algorithm's map; `frank_wolfe` and `penalty`
-    say whether the algorithm takes Frank-Wolfe steps and has the penalty term; `steps` is the task's length of
-    training and `simulator` the one that it runs on, where there is a choice.
-    """
-    group = robot if robot in ("Reacher", "Hopper") else "Others"
-    table = dict(HYPERPARAMETERS[group, base])
-    if base == "TD3":
-        table |= TD3_CONSTANTS
-    else:
-        table |= ENTROPY_CHOICES.get(mapping, {})
-    if not frank_wolfe:
-        table.pop("fw_learning_rate", None)
-    if penalty:
-        table["penalty"] = 1.0
-    return Config(algo=algo, env=env, steps=steps, simulator=simulator, **table)
+# ---------------------------------------------------------------- values on the command line
 
 
-def parse_seeds(text: str) -> list[int]:
+def parse_seeds(text: str) -> tuple[int, ...]:
     """Seeds of `3`, `0-9`, `1,4,7` or a mixture, ascending and without repetition."""
     seeds: set[int] = set()
     for part in text.split(","):
@@ -167,7 +143,7 @@ def parse_seeds(text: str) -> list[int]:
         if high - low >= 1000 or high >= 2**31:
             raise ConfigError(f"bad seed {text!r}: at most 1000 seeds a range, each below 2^31")
         seeds.update(range(low, high + 1))
-    return sorted(seeds)
+    return tuple(sorted(seeds))
 
 
 def override(config: DictConfig, schema: type, key: str, text: str, prefix: str = "") -> None:
@@ -177,25 +153,27 @@ def override(config: DictConfig, schema: type, key: str, text: str, prefix: str 
     """
     if text in ("null", "None", "~"):
         raise ConfigError(f"bad value {text!r} for {prefix}{key}: a value is needed")
+    name = keys_of(schema)[key].name
+    kind = typing.get_type_hints(schema)[name]
     try:
-        OmegaConf.update(config, key, _typed(schema, key, text))
+        OmegaConf.update(config, name, _typed(kind, text))
     except OmegaConfBaseException:
-        kind = next(f.type for f in fields(schema) if f.name == key).replace(" | None", "")
-        raise ConfigError(f"bad value {text!r} for {prefix}{key}: expected {kind}") from None
+        kinds = [k for k in typing.get_args(kind) or [kind] if k is not type(None)]
+        expected = str(kind) if typing.get_origin(kind) is list else " or ".join(k.__name__ for k in kinds)
+        raise ConfigError(f"bad value {text!r} for {prefix}{key}: expected {expected}") from None
 
 
-def _typed(schema: type, key: str, text: str) -> object:
-    """The text of one override, made ready for the type check of its field."""
-    kind = typing.get_type_hints(schema)[key]
+def _typed(kind: Any, text: str) -> object:
+    """The text of one override, made ready for the type check of a field of the type `kind`."""
+    if typing.get_origin(kind) is tuple:
+        return list(parse_seeds(text))
     if typing.get_origin(kind) is list:
         return [_whole(part) for part in text.removeprefix("[").removesuffix("]").split(",")]
-    if int in (kind, *typing.get_args(kind)):
-        return _whole(text)
-    return str(int(text)) if key == "train_freq" and text.isdecimal() else text
+    return _whole(text) if int in (kind, *typing.get_args(kind)) else text
 
 
 def _whole(text: str) -> int | str:
-    """3e5 is a whole number to a person; what is none is left to the type check."""
+    """3e5 is a whole number to a person. The type check refuses a text that is none."""
     try:
         number = float(text)
     except ValueError:
@@ -205,53 +183,55 @@ def _whole(text: str) -> int | str:
 
 def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
     """`base` with the overrides, type-checked by OmegaConf and range-checked; ConfigError for what does not fit."""
+    schema = type(base)
     config = OmegaConf.structured(base)
     for key, text in overrides.items():
         if key in ("algo", "env"):
             continue
-        if getattr(base, key) is None:
-            raise ConfigError(f"{key} does not apply to {base.env if key == 'simulator' else base.algo}")
-        override(config, Config, key, text)
+        if key not in keys_that_apply(base):
+            raise ConfigError(f"{key} does not apply to {base.algo} on {base.env}")
+        override(config, schema, key, text)
     resolved = typing.cast(Config, OmegaConf.to_object(config))
-    _check_ranges(resolved)
+    resolved.seeds = tuple(resolved.seeds)  # OmegaConf makes a list of it
+    check_ranges(resolved)
     return resolved
 
 
-def _check_ranges(config: Config) -> None:
-    def demand(key: str, ok: bool, what: str) -> None:
-        if not ok:
-            raise ConfigError(f"bad value {getattr(config, key)!r} for {key}: {what}")
+def check_ranges(config: Config) -> None:
+    """ConfigError for a number that is not finite or a value that breaks the rule of its field."""
+    for key, f in keys_of(config).items():
+        value, rule = getattr(config, f.name), f.metadata.get("rule")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"bad value {value!r} for {key}: must be finite")
+        if rule and not rule.holds(value):
+            raise ConfigError(f"bad value {value!r} for {key}: {rule.words}")
 
-    for key, value in asdict(config).items():
-        if isinstance(value, float):
-            demand(key, math.isfinite(value), "must be finite")
-    counts = ("steps", "batch_size", "buffer_size", "eval_every", "eval_episodes", "final_episodes")
-    for key in (*counts, "threads", "checkpoint_every"):
-        demand(key, getattr(config, key) >= 1, "must be at least 1")
-    for key in ("learning_starts", "action_noise", "target_noise", "target_noise_clip", "penalty", "log_det_floor"):
-        demand(key, (getattr(config, key) or 0) >= 0, "must not be negative")
-    demand("gamma", 0 <= config.gamma <= 1, "must be in [0, 1]")
-    demand("tau", 0 < config.tau <= 1, "must be in (0, 1]")
-    demand("learning_rate", config.learning_rate > 0, "must be positive")
-    demand("fw_learning_rate", config.fw_learning_rate is None or 0 < config.fw_learning_rate <= 1, "must be in (0, 1]")
-    demand("policy_delay", config.policy_delay is None or config.policy_delay >= 1, "must be at least 1")
-    demand("entropy", config.entropy in (None, "paper", "ball"), "must be 'paper' or 'ball'")
-    demand("boundary_weight", config.boundary_weight is None or config.boundary_weight > 0, "must be positive")
-    demand("hidden", min(config.hidden) >= 1, "must list positive widths")
-    demand("gradient_steps", config.gradient_steps == -1 or config.gradient_steps >= 1, "must be -1 or at least 1")
-    # Whether there is such a GPU, only the machine that trains can tell.
-    demand("device", bool(re.fullmatch(r"cpu|cuda(:[0-9]+)?", config.device)), "must be cpu, cuda or cuda:N")
-    freq = config.train_freq
-    demand("train_freq", freq == "episode" or (freq.isdecimal() and int(freq) >= 1), "must be steps or 'episode'")
+
+# ---------------------------------------------------------------- what a run's name and folder hold
 
 
 def differences(config: Config, base: Config) -> dict[str, object]:
-    """The settings of `config` that make it another experiment than `base`, seeds apart."""
-    names = [f.name for f in fields(Config) if f.name not in RUN_KEYS]
-    return {name: getattr(config, name) for name in names if getattr(config, name) != getattr(base, name)}
+    """The settings of `config` that make it another experiment than `base`, by key. Seeds do not."""
+    both = {key: (getattr(config, f.name), getattr(base, f.name)) for key, f in keys_of(config).items()}
+    return {key: value for key, (value, paper) in both.items() if key not in RUN_KEYS and value != paper}
 
 
 def saved_settings(config: Config, seed: int) -> dict[str, object]:
-    """The configuration of one seed as its run folder keeps it."""
-    settings = asdict(config) | {"seed": str(seed)}
+    """The configuration of one seed as its run folder keeps it, by key."""
+    settings = {key: getattr(config, f.name) for key, f in keys_of(config).items()}
+    settings |= {"seed": str(seed), "train_freq": str(config.train_freq)}
     return {key: value for key, value in settings.items() if key not in ("results", "overwrite")}
+
+
+def restore_settings(schema: type[Config], saved: Mapping[str, Any]) -> Config:
+    """The configuration that `saved_settings` has described, of the dataclass `schema`.
+
+    Keys that the schema does not have, and those without a value, are ignored. Raises TypeError where algorithm or
+    task is missing, and ConfigError for a bad seed.
+    """
+    values = {f.name: saved[key] for key, f in keys_of(schema).items() if saved.get(key) is not None}
+    if "seeds" in values:
+        values["seeds"] = parse_seeds(str(values["seeds"]))
+    if "train_freq" in values:
+        values["train_freq"] = _whole(str(values["train_freq"]))
+    return schema(**values)

@@ -11,14 +11,17 @@ import torch
 from torch import Tensor
 
 from core.random import stream_seed
-from envs import InfeasibleActionError, step_together
+
+StepTogether = Callable[[Sequence[Any], np.ndarray], Sequence[Any]]
+"""Steps environments, each with its action (d,) of (environments, d). Returns for each what `step` returns or, for an
+action that it refuses, the error that `step` raises."""
 
 
 class Evaluator:
     """Owns `parallel` environments a seed, made when first needed; their random streams belong to the seed.
 
-    `check` is called before every step. Whatever it or something else raises, the environments' random streams are
-    put back, so that the evaluation can be made again.
+    `stop_if_asked` is called before every step and raises to stop. Any exception puts the environments' random streams
+    back, so that the evaluation can be repeated.
     """
 
     def __init__(
@@ -26,16 +29,18 @@ class Evaluator:
         make_env: Callable[[], gymnasium.Env],
         seeds: Sequence[int],
         parallel: int,
-        check: Callable[[], None],
+        step_together: StepTogether,
+        stop_if_asked: Callable[[], None],
     ):
-        self.make_env, self.seeds, self.parallel, self.check = make_env, seeds, parallel, check
+        self.make_env, self.seeds, self.parallel = make_env, seeds, parallel
+        self.step_together, self.stop_if_asked = step_together, stop_if_asked
         self.envs: dict[int, list[Any]] = {}
         self.refused: dict[int, str] = {}  # position of a seed -> why its policy's action was refused, in the last run
 
     def run(self, policy: Callable[[Tensor], Tensor], which: Sequence[int], episodes: int) -> np.ndarray:
-        """Returns (len(which), episodes) of `policy`, which maps obs (len(which), m, n) to feasible actions.
+        """The returns (len(which), episodes) of `policy`, which maps obs (len(which), m, n) to feasible actions.
 
-        NaN where the environment refused an action.
+        A return is NaN where the environment refused an action.
         """
         returns, self.refused = [], {}
         before = {i: [env.unwrapped.get_state() for env in self._envs_of(i)] for i in which}
@@ -55,12 +60,12 @@ class Evaluator:
         returns = np.zeros(len(envs))
         running = list(range(len(envs)))
         while running:
-            self.check()
+            self.stop_if_asked()
             actions = policy(seen).flatten(0, 1).numpy()
             still_running = []
-            outcomes = step_together([envs[k] for k in running], actions[running])
+            outcomes = self.step_together([envs[k] for k in running], actions[running])
             for k, outcome in zip(running, outcomes, strict=True):
-                if isinstance(outcome, InfeasibleActionError):
+                if isinstance(outcome, Exception):
                     self.refused[which[k // count]] = str(outcome)
                     returns[k] = np.nan
                     continue

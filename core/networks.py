@@ -133,11 +133,3 @@ class Adam(torch.optim.Adam):
         )
 
     step.hooked = True  # type: ignore[attr-defined]  # tells PyTorch not to wrap it for its profiler
-
-
-def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-    """One step on `loss`, with gradients for the optimiser's own parameters alone."""
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
-        parameter.grad = gradient
-    optimizer.step()

@@ -12,15 +12,18 @@ from core.random import Streams
 
 
 class Batch(NamedTuple):
-    """Transitions (seeds, batch, features); the centres are None where the algorithm does not use any."""
+    """Transitions (seeds, batch, features). The replay buffer has the columns in the same order.
+
+    The centres are None where the algorithm does not use any.
+    """
 
     obs: Tensor
     action: Tensor
     reward: Tensor  # (seeds, batch)
     terminated: Tensor  # (seeds, batch): 1 where the episode ended for good; a time limit is no end
     next_obs: Tensor
-    center: Tensor | None
-    next_center: Tensor | None
+    center: Tensor | None = None
+    next_center: Tensor | None = None
 
 
 class Replay:
@@ -36,19 +39,22 @@ class Replay:
         device: torch.device | str = "cpu",
     ):
         self.capacity = capacity
-        # The next observation is stored beside its own, although it comes again in the next row (but at an episode's
-        # end): a transition is one stretch of memory, and memory's latency is what sampling costs.
-        self.widths = [obs_dim, action_dim, 1, 1, obs_dim] + [action_dim] * (2 if centers else 0)
+        # Most next observations are stored twice, as they come again in the next row. A transition is thus one stretch
+        # of memory, and sampling costs memory's latency.
+        center_dim = action_dim if centers else 0
+        widths = {"obs": obs_dim, "action": action_dim, "reward": 1, "terminated": 1, "next_obs": obs_dim}
+        widths |= {"center": center_dim, "next_center": center_dim}
+        self.widths = [widths[column] for column in Batch._fields if widths[column]]
         self.rows = torch.empty(len(seeds) * capacity, sum(self.widths), device=device)
         self.offsets = torch.arange(len(seeds), device=device).unsqueeze(1) * capacity
-        self.rows[self.offsets] = 0.0  # what a seed without transitions samples: one that failed at its first step
+        self.rows[self.offsets] = 0.0  # a seed that fails at its first step has no transitions and samples this row
         self.added = [0] * len(seeds)
         self.streams = Streams(seeds, "replay", device)
 
-    def add(self, which: Sequence[int], *columns: Tensor) -> None:
-        """Append one transition to each seed of `which`; `columns` (seeds, features) in the order of `Batch`."""
+    def add(self, which: Sequence[int], transitions: Batch) -> None:
+        """Append one transition to each seed of `which`. All columns are (seeds, features), with one reward each."""
         places = [i * self.capacity + self.added[i] % self.capacity for i in which]
-        rows = torch.cat(columns, dim=-1)[list(which)]
+        rows = torch.cat([column for column in transitions if column is not None], dim=-1)[list(which)]
         self.rows.index_copy_(0, torch.tensor(places).to(self.rows.device), rows.to(self.rows.device))
         for i in which:
             self.added[i] += 1

@@ -160,6 +160,7 @@ class _Upright(_Locomotion):
 class Hopper(_Upright):
     """Observation (11,), action (3,). Falls below 0.7 m, past 0.2 rad or at a state beyond +-100."""
 
+    hyperparameters = "Hopper"  # its group in the paper's table
     model_file, obs_dim, action_dim = "hopper.xml", 11, 3
 
     def _healthy(self) -> bool:

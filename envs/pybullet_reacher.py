@@ -49,8 +49,8 @@ class PyBulletReacher(Robot):
         except ImportError as error:
             python = f"{sys.version_info.major}.{sys.version_info.minor}"
             raise UnavailableError(
-                "simulator 'pybullet' needs the package pybullet, which has wheels for Linux on x86-64 with Python up to"
-                f" 3.11 (this is Python {python}); the default simulator gives the same joint angles in every bit"
+                "simulator 'pybullet' needs the package pybullet, which has wheels for Linux on x86-64 with Python up"
+                f" to 3.11 (this is Python {python}); the default simulator gives the same joint angles in every bit"
             ) from error
         self._bullet = bullet = pybullet
         self._client = client = bullet.connect(bullet.DIRECT)

@@ -258,6 +258,7 @@ class Reacher(Robot):
     Action (2,): torques of the two joints in units of 0.05.
     """
 
+    hyperparameters = "Reacher"  # its group in the paper's table
     obs_dim, action_dim = 9, 2
     max_episode_steps = 150
     fps = 61  # 1 / 0.0165 s

@@ -29,6 +29,8 @@ class Robot(ABC):
     max_episode_steps: int
     fps: int
     """Steps in a second of simulated time, at which a video shows real time."""
+    hyperparameters: str = "Others"
+    """The group of robots in the paper's table of hyperparameters whose values algorithms take."""
     simulators: Mapping[str, str] = {}
     """The simulators among which a user can choose: name -> "module:class", imported when chosen. The first is this
     class itself; a robot without a choice has none."""

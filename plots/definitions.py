@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields
 from itertools import groupby
-from typing import Any, get_args
+from typing import Any
 
-from core.agent import MapName
-from core.config import HYPERPARAMETERS, RUN_KEYS, Config, defaults
+from algos import ALGORITHMS, setting_keys
+from core.config import RUN_KEYS, keys_of
 from envs.tasks import TASKS, Task
 from tables import MISSING, Table, TableCell, text_cells
 
@@ -33,33 +32,35 @@ def task_table(tasks: Mapping[str, Task] = TASKS) -> Table:
 
 def hyperparameter_table() -> Table:
     """The paper's Table "Hyperparameters used in the experiments", then the constants that it leaves to its sources."""
-    columns = {group: _configuration(*group) for group in HYPERPARAMETERS}
-    in_paper = {key for settings in HYPERPARAMETERS.values() for key in settings}
+    columns = _configurations()
+    tables = [algorithm.agent.paper for algorithm in ALGORITHMS.values()]
+    in_paper = {key for table in tables for settings in table.values() for key in settings}
     published: list[list[TableCell]] = []
     further: list[list[TableCell]] = []
     records = []
-    for setting in fields(Config):
-        key = setting.name
+    for key, setting in setting_keys().items():
         values = [config.get(key) for config in columns.values()]
         if key in (*RUN_KEYS, "steps") or all(value is None for value in values):
             continue
         row = text_cells(key, setting.metadata["help"], *(_text(value) for value in values))
         (published if key in in_paper else further).append(row)
-        for (robot, base), value in zip(columns, values, strict=True):
-            records.append({"setting": key, "robot": robot, "base": base, "value": value})
-    header = ["Setting", "Meaning", *(f"{robot} {base}" for robot, base in columns)]
+        for (robot, family), value in zip(columns, values, strict=True):
+            records.append({"setting": key, "robot": robot, "base": family, "value": value})
+    header = ["Setting", "Meaning", *(f"{robot} {family}" for robot, family in columns)]
     spans = {robot: len(list(group)) for robot, group in groupby(robot for robot, _ in columns)}
     title = "Hyperparameters of the paper's table, then constants and protocol"
     return Table("hyperparameters", title, header, 2, [published, further], records, spans)
 
 
-def _configuration(robot: str, base: str) -> dict[str, Any]:
-    """Every setting on `robot` of any algorithm with this base."""
-    settings: dict[str, Any] = {}
-    for mapping in get_args(MapName):
-        config = defaults("", "", robot, base, mapping, frank_wolfe=base == "TD3", penalty=True, steps=0)
-        settings |= {key: value for key, value in asdict(config).items() if value is not None}
-    return settings
+def _configurations() -> dict[tuple[str, str], dict[str, Any]]:
+    """By group of robots and family of algorithms, every setting of any algorithm of this family."""
+    columns: dict[tuple[str, str], dict[str, Any]] = {}
+    for group in dict.fromkeys(group for algorithm in ALGORITHMS.values() for group in algorithm.agent.paper):
+        for name, algorithm in ALGORITHMS.items():
+            config = algorithm.paper_config(name, "", group, steps=0)
+            settings = {key: getattr(config, f.name) for key, f in keys_of(config).items()}
+            columns.setdefault((group, algorithm.agent.family), {}).update(settings)
+    return columns
 
 
 def _text(value: Any) -> str:

@@ -15,9 +15,8 @@ from matplotlib.patches import Polygon
 from torch import Tensor
 
 import envs
-from algos import ALGORITHMS
+from algos import ALGORITHMS, saved_config
 from constraints import Constraint, LinearConstraint
-from core.config import Config
 from core.random import stream_seed
 from core.words import ConfigError
 from plots.paper import order_tasks
@@ -112,7 +111,7 @@ def play(run: Run) -> Episode:
     env = envs.make(run.task)
     try:
         obs_dim = env.observation_space.shape[0]
-        agent = ALGORITHMS[run.algo].build(Config(**run.config), env.constraint, obs_dim, [run.seed])
+        agent = ALGORITHMS[run.algo].build(saved_config(run.config), env.constraint, obs_dim, [run.seed])
         agent.load_state(0, torch.load(run.folder / "best.pt", weights_only=True))
     except (OSError, TypeError, KeyError, RuntimeError) as error:
         raise ConfigError(f"{run.folder / 'best.pt'}: cannot load it ({error})") from error

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from algos import ALGORITHMS, NFWPO, PAPER
-from core.config import Config, defaults, differences, parse_seeds, resolve
-from core.words import ConfigError, split_names
+from algos import ALGORITHMS, PAPER, paper_settings, setting_keys
+from core.config import Config, differences, keys_that_apply, resolve
+from core.words import ConfigError, parse_words, split_names
 from envs import TASKS
 from store.files import replace_file
 from store.folder import parse_variant, run_folder, variant_name
@@ -90,16 +90,20 @@ class Cell(CellFolders):
 
     @classmethod
     def of(cls, config: Config) -> Cell:
-        """The cell that `config` describes. Raises ConfigError for seeds that cannot be read."""
+        """The cell that `config` describes."""
         paper = paper_config(config.algo, config.env)
         return cls(
             root=Path(config.results).expanduser(),
             task=config.env,
             variant=variant_name(config.algo, differences(config, paper)),
-            seeds=tuple(parse_seeds(config.seed)),
+            seeds=config.seeds,
             config=config,
             paper=paper,
         )
+
+    def __reduce__(self) -> tuple:
+        # A cell is pickled as its words: the classes of configurations are made at run time.
+        return _cell_of, (self.words,)
 
     @property
     def words(self) -> list[str]:
@@ -117,18 +121,9 @@ class Cell(CellFolders):
 
 def paper_config(name: str, task: str) -> Config:
     """The paper's configuration of the algorithm `name` on `task`."""
-    algorithm = ALGORITHMS[name]
-    return defaults(
-        algo=name,
-        env=task,
-        robot=TASKS[task].robot.__name__,
-        base=algorithm.base,
-        mapping=algorithm.mapping,
-        frank_wolfe=issubclass(algorithm.agent, NFWPO),
-        penalty=algorithm.penalty,
-        steps=TASKS[task].steps,
-        simulator=next(iter(TASKS[task].robot.simulators), None),
-    )
+    robot = TASKS[task].robot
+    simulator = next(iter(robot.simulators), None)
+    return replace(paper_settings(name, task, robot, TASKS[task].steps), simulator=simulator)
 
 
 def make_cells(settings: Mapping[str, str]) -> list[Cell]:
@@ -146,13 +141,17 @@ def make_cells(settings: Mapping[str, str]) -> list[Cell]:
 
     def applies(key: str, paper: Config) -> bool:
         # A key that no algorithm has is a mistake, which `resolve` reports.
-        has_it = getattr(paper, key) is not None
-        return key in ("algo", "env") or has_it or all(getattr(other, key) is None for other in papers)
+        return key in keys_that_apply(paper) or not any(key in keys_that_apply(other) for other in papers)
 
     return [
         Cell.of(resolve(paper, {key: text for key, text in settings.items() if applies(key, paper)}))
         for paper in papers
     ]
+
+
+def _cell_of(words: Sequence[str]) -> Cell:
+    (cell,) = make_cells(parse_words(words, setting_keys()))
+    return cell
 
 
 def shorten(cells: Sequence[CellFolders]) -> tuple[list[str], str]:

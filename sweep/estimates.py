@@ -10,13 +10,11 @@ import csv
 import heapq
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from algos import ALGORITHMS
-from core.agent import stores_centers
+from algos import ALGORITHMS, saved_config
 from core.config import Config
 from envs import TASKS
 from store.folder import Run
@@ -57,11 +55,12 @@ def _rates() -> dict[tuple[str, str], Rate]:
 
 @cache
 def _rate(task: str, algo: str) -> Rate:
-    """The measured rate of a cell; of one that is not measured, the mean over cells of its robot and class of agent."""
+    """The measured rate of a cell. Without one: the mean over cells of the same robot and family of algorithms."""
     if (task, algo) in _rates():
         return _rates()[task, algo]
+    family = ALGORITHMS[algo].agent.family
     same_robot = {key: rate for key, rate in _rates().items() if TASKS[key[0]].robot == TASKS[task].robot}
-    near = [rate for key, rate in same_robot.items() if ALGORITHMS[key[1]].agent == ALGORITHMS[algo].agent]
+    near = [rate for key, rate in same_robot.items() if ALGORITHMS[key[1]].agent.family == family]
     return Rate(*map(statistics.mean, zip(*(near or same_robot.values() or _rates().values()), strict=True)))
 
 
@@ -72,7 +71,7 @@ def seconds(config: Config, seeds: int, start: int = 0) -> float:
     update = 1e-3 * rate.update_ms * (seeds + UPDATE_OVERHEAD) / (SEEDS + UPDATE_OVERHEAD)
     measured = paper_config(config.algo, config.env).batch_size
     update *= (config.batch_size + BATCH_OVERHEAD) / (measured + BATCH_OVERHEAD)
-    rollout = robot.max_episode_steps if config.train_freq == "episode" else int(config.train_freq)
+    rollout = config.train_freq if isinstance(config.train_freq, int) else robot.max_episode_steps
     per_step = 1.0 if config.gradient_steps == -1 else config.gradient_steps / rollout
     updates = per_step * (config.steps - max(start, config.learning_starts))
     evaluations = config.steps // config.eval_every - start // config.eval_every
@@ -84,7 +83,7 @@ def seconds(config: Config, seeds: int, start: int = 0) -> float:
 def memory(config: Config, seeds: int) -> float:
     """Bytes, with the replay buffer as full as it gets."""
     robot = _robot(config)
-    centers = 2 if stores_centers(ALGORITHMS[config.algo].mapping, TASKS[config.env].constraint) else 0
+    centers = 2 if ALGORITHMS[config.algo].map.stores_centers(TASKS[config.env].constraint) else 0
     width = 2 * robot.obs_dim + (1 + centers) * robot.action_dim + 2
     return PROCESS_BYTES + seeds * (SEED_BYTES + 4.0 * width * min(config.buffer_size, config.steps))
 
@@ -98,14 +97,12 @@ def corrections(runs: Iterable[Run], device: str) -> dict[tuple[str, str], float
 
     Leaves out runs on another kind of `device`, with other layers, too short to tell, or without their time.
     """
-    names = {f.name for f in fields(Config)}
     ratios: dict[tuple[str, str], list[float]] = {}
     for run in runs:
         if run.result is None or run.task not in TASKS or run.algo not in ALGORITHMS:
             continue
-        saved = {key: value for key, value in run.config.items() if key in names}
-        config = Config(**{"env": run.task, "algo": run.algo} | saved)
         try:
+            config = saved_config(run.config | {"env": run.task, "algo": run.algo})
             took, seeds = float(run.result["seconds"]["total"]), int(run.result["seeds_in_lockstep"])
             steps = int(run.result["gradient_steps"])
         except (KeyError, TypeError, ValueError):

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, fields
 
 from omegaconf import OmegaConf
 
-from core.config import KEYS, override
+from algos import setting_keys
+from core.config import override
 from core.words import ConfigError, known_name, parse_words
 
 SLURM_PREFIX = "slurm."
@@ -61,7 +62,8 @@ def parse_sweep(words: Sequence[str]) -> tuple[Sweep, dict[str, str]]:
     settings, slurm = OmegaConf.structured(SweepSettings), OmegaConf.structured(SlurmSettings)
     sbatch: dict[str, str] = {}
     cells: dict[str, str] = {}
-    given = parse_words(words, [*KEYS, *own, *(SLURM_PREFIX + name for name in slurm_names)], free=SLURM_PREFIX)
+    keys = [*setting_keys(), *own, *(SLURM_PREFIX + name for name in slurm_names)]
+    given = parse_words(words, keys, free=SLURM_PREFIX)
     for key, text in given.items():
         name = key.removeprefix(SLURM_PREFIX)
         if key in own:

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 
 import envs
-from algos import ALGORITHMS
-from core.config import KEYS, RUN_KEYS, Config, saved_settings
+from algos import ALGORITHMS, setting_keys
+from core.config import RUN_KEYS, Config, saved_settings
 from core.trainer import Trainer
 from core.words import ConfigError, parse_words
 from envs import TASKS, TOLERANCE
@@ -33,7 +33,7 @@ def train_words(words: str) -> bool:
     Returns whether every seed has a result; a seed that diverged has none. Raises ConfigError for wrong words,
     ConstraintError for a constraint that breaks down and LockedError if another process trains a run.
     """
-    return train_cells(make_cells(parse_words(words.split(), KEYS))) is Exit.DONE
+    return train_cells(make_cells(parse_words(words.split(), setting_keys()))) is Exit.DONE
 
 
 def train_cells(cells: Sequence[Cell], stop_if_asked: Callable[[], None] = lambda: None) -> Exit:
@@ -106,7 +106,7 @@ def make_trainer(
     obs_dim = train_envs[0].observation_space.shape[0]
     try:
         agent = ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, list(seeds))
-        return Trainer(config, agent, train_envs, make_env, writers, progress, stop_if_asked)
+        return Trainer(config, agent, train_envs, make_env, envs.step_together, writers, progress, stop_if_asked)
     except RuntimeError as error:
         if not any(words in str(error) for words in ("allocate memory", "out of memory")):
             raise
@@ -206,18 +206,20 @@ def _run(trainer: Trainer) -> None:
     try:
         results = trainer.run()
     except (Interrupted, KeyboardInterrupt):
+        step = max(seed.steps for seed in trainer.seeds)
         print(
-            f"\ninterrupted at step {max(trainer.steps)}; the same command resumes (without overwrite=true)"
-            f" (unfinished runs are in {trainer.writers[0].folder.parent})",
+            f"\ninterrupted at step {step}; the same command resumes (without overwrite=true)"
+            f" (unfinished runs are in {trainer.seeds[0].writer.folder.parent})",
             file=sys.stderr,
         )
         raise
-    for i, (writer, result) in enumerate(zip(trainer.writers, results, strict=True)):
+    for seed, result in zip(trainer.seeds, results, strict=True):
+        folder = seed.writer.folder
         if result is None:
-            print(f"{writer.folder}: {describe_failure(trainer.failures[i])}", file=sys.stderr)
+            print(f"{folder}: {describe_failure(seed.failure)}", file=sys.stderr)
         else:
             print(
-                f"{writer.folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
+                f"{folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
                 f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e})"
             )
 

@@ -7,7 +7,7 @@ import torch
 
 import plot
 import run
-from core.config import KEYS
+from algos import setting_keys
 from core.words import parse_words
 from store.folder import RunWriter, find_runs, read_run, run_folder, variant_name
 from store.interrupt import Interrupted
@@ -33,7 +33,7 @@ class Breaks:
 
 def cells_of(words):
     """The cells that the words of a command ask for."""
-    return make_cells(parse_words(words.split() if isinstance(words, str) else words, KEYS))
+    return make_cells(parse_words(words.split() if isinstance(words, str) else words, setting_keys()))
 
 
 def config_of(words):

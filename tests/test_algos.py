@@ -10,14 +10,13 @@ from torch.distributions import Normal
 from algos import ALGORITHMS
 from algos.sac import StateDependentActor
 from constraints import Box, WeightedPositivePart
-from core.config import defaults
 from core.random import Streams
 from core.replay import Batch
 
 SEEDS, OBS, DIM, BATCH = [3, 8], 3, 2, 12
 CONSTRAINT = WeightedPositivePart(lambda obs: 2.0 * obs[..., :DIM] + 3.0, 0.8, DIM)  # its centre is not the origin
-TD3_NAMES = [name for name, algorithm in ALGORITHMS.items() if algorithm.base == "TD3"]
-SAC_NAMES = [name for name, algorithm in ALGORITHMS.items() if algorithm.base == "SAC"]
+TD3_NAMES = [name for name, algorithm in ALGORITHMS.items() if algorithm.agent.family == "TD3"]
+SAC_NAMES = [name for name, algorithm in ALGORITHMS.items() if algorithm.agent.family == "SAC"]
 CASES = [(name, False) for name in ALGORITHMS] + [(name, True) for name in SAC_NAMES]
 IDS = [name + (" with gSDE" if gsde else "") for name, gsde in CASES]
 
@@ -25,31 +24,15 @@ IDS = [name + (" with gSDE" if gsde else "") for name, gsde in CASES]
 def make_agent(name, gsde=False, constraint=CONSTRAINT, seeds=SEEDS, **settings):
     """An agent with small networks whose outputs are not small, so that maps and clips all matter."""
     algorithm = ALGORITHMS[name]
-    paper = defaults(
-        algo=name,
-        env="W+M",
-        robot="Reacher" if gsde else "Walker2d",
-        base=algorithm.base,
-        mapping=algorithm.mapping,
-        frank_wolfe=name == "NFW",
-        penalty=algorithm.penalty,
-        steps=1,
-    )
+    paper = algorithm.paper_config(name, "W+M", "Reacher" if gsde else "Others", steps=1)
     settings = {"gamma": 0.9, "hidden": [8, 8], "tau": 0.1} | settings
-    if algorithm.base == "TD3":
+    if name in TD3_NAMES:
         settings = {"target_noise": 1.0, "target_noise_clip": 0.6} | settings
     if algorithm.penalty:
         settings = {"penalty": 1.5} | settings
     if name == "NFW":
         settings = {"fw_learning_rate": 0.3} | settings
-    agent = algorithm.agent(
-        replace(paper, **settings),
-        constraint,
-        OBS,
-        list(seeds),
-        mapping=algorithm.mapping,
-        placement=algorithm.placement,
-    )
+    agent = algorithm.build(replace(paper, **settings), constraint, OBS, list(seeds))
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         for parameter in [p for module in agent.networks().values() for p in module.parameters()]:
@@ -74,9 +57,21 @@ def make_batch(seed=0):
 # ---------------------------------------------------------------- the formulas, for one seed: obs (batch, n)
 
 
+MAPS = {"Alpha": "alpha_map", "Rad": "radial_map", "Gauge": "gauge_map"}
+
+
 def map_of(agent):
-    """The map of the paper's name, "project" for most."""
-    return {"DAlpha": "alpha", "SAlpha": "alpha", "DRad": "radial", "SRad": "radial"}.get(agent.config.algo, "project")
+    """The constraint's method for the map of an agent's name, "project" for most."""
+    return MAPS.get(agent.config.algo[1:], "project")
+
+
+def squashes(agent):
+    return map_of(agent) in ("project", "gauge_map")
+
+
+def mapped(agent, obs, suggested, center=None):
+    arguments = (obs, suggested) if map_of(agent) == "project" else (obs, suggested, center)
+    return getattr(CONSTRAINT, map_of(agent))(*arguments)
 
 
 def mlp(net, row, x):
@@ -95,9 +90,8 @@ def q_values(critic, i, obs, action):
 def deterministic(agent, actor, i, obs, center):
     """A TD3 actor's suggestion and what its map makes of it."""
     raw = mlp(actor, i, obs)
-    if map_of(agent) == "project":
-        return raw.tanh(), CONSTRAINT.project(obs, raw.tanh())
-    return raw, (CONSTRAINT.alpha_map if map_of(agent) == "alpha" else CONSTRAINT.radial_map)(obs, raw, center)
+    suggested = raw.tanh() if squashes(agent) else raw
+    return suggested, mapped(agent, obs, suggested, center)
 
 
 def moments(agent, actor, i, obs):
@@ -115,9 +109,14 @@ def sampled(agent, actor, i, obs, center, noise):
     mean, std, latent = moments(agent, actor, i, obs)
     raw = mean + (std * noise if latent is None else latent @ (actor.log_std[i].exp() * noise))
     normal = Normal(mean, std).log_prob(raw).sum(-1)
+    after_tanh = normal + 2 * raw.double().cosh().log().sum(-1)
     if map_of(agent) == "project":
-        return raw.tanh(), raw.tanh(), normal + 2 * raw.double().cosh().log().sum(-1)
-    if map_of(agent) == "alpha":
+        return raw.tanh(), raw.tanh(), after_tanh
+    if map_of(agent) == "gauge_map":
+        u = raw.tanh()
+        ratio = u.abs().amax(-1) / CONSTRAINT.gauge(obs, u, center)
+        return u, CONSTRAINT.gauge_map(obs, u, center), after_tanh - DIM * ratio.log()
+    if map_of(agent) == "alpha_map":
         return (
             raw,
             CONSTRAINT.alpha_map(obs, raw, center),
@@ -144,8 +143,8 @@ def expected_actor_loss(name, agent, actor, temperature, batch, noise):
             reference = CONSTRAINT.project(obs, suggested + 0.3 * (vertex - projected)).detach()
             loss = ((suggested - reference) ** 2).sum(-1)
         else:
-            suggested, mapped = deterministic(agent, actor, i, obs, center)
-            seen = mapped if name in ("DOpt", "DOpt+", "DAlpha", "DRad") else suggested
+            suggested, executed = deterministic(agent, actor, i, obs, center)
+            seen = executed if name in ("DOpt", "DOpt+", "DAlpha", "DRad", "DGauge") else suggested
             loss = -q_values(agent.critic, i, obs, seen)[0]
         if name.endswith("+"):
             loss = loss + 1.5 * CONSTRAINT.penalty(obs, suggested)
@@ -163,10 +162,10 @@ def expected_targets(name, agent, before, temperature, batch, noise):
             _, action, log_prob = sampled(agent, before["actor"], i, obs, center, noise[i])
             value = -temperature[i] * log_prob
         else:
-            suggested, mapped = deterministic(agent, before["actor_target"], i, obs, center)
-            action = (suggested if name in ("DPre", "DPre+") else mapped) + noise[i].clamp(-0.6, 0.6)
-            mapped_back = CONSTRAINT.alpha_map(obs, action, center)
-            action = mapped_back if name in ("DAlpha", "DRad") else action.clamp(-1, 1)
+            suggested, executed = deterministic(agent, before["actor_target"], i, obs, center)
+            action = (suggested if name in ("DPre", "DPre+") else executed) + noise[i].clamp(-0.6, 0.6)
+            pulled_back = CONSTRAINT.alpha_map(obs, action, center)
+            action = pulled_back if name in ("DAlpha", "DRad", "DGauge") else action.clamp(-1, 1)
             value = 0.0
         value = value + q_values(before["critic_target"], i, obs, action).amin(0)
         rows.append(batch.reward[i] + 0.9 * (1 - batch.terminated[i]) * value)
@@ -315,7 +314,7 @@ def test_targets_follow_with_tau(name):
         old, new = snapshot(before[key]), snapshot(agent.networks()[key])
         for o, s, n in zip(old, source, new, strict=True):
             torch.testing.assert_close(n, 0.9 * o + 0.1 * s)
-    targets = {"TD3": {"actor_target", "critic_target"}, "SAC": {"critic_target"}}[ALGORITHMS[name].base]
+    targets = {"TD3": {"actor_target", "critic_target"}, "SAC": {"critic_target"}}[ALGORITHMS[name].agent.family]
     assert {key for key in agent.networks() if key.endswith("_target")} == targets
 
 
@@ -362,9 +361,7 @@ def test_choices_of_entropy_change_the_density_and_nothing_else(name, settings, 
 
 
 def test_the_temperature_starts_at_one_for_every_seed():
-    agent = ALGORITHMS["SPre"].agent(
-        make_agent("SPre").config, CONSTRAINT, OBS, SEEDS, mapping="project", placement="environment"
-    )
+    agent = ALGORITHMS["SPre"].build(make_agent("SPre").config, CONSTRAINT, OBS, SEEDS)
     assert torch.equal(agent.temperature.log_alpha, torch.zeros(len(SEEDS), 1))
 
 
@@ -444,8 +441,7 @@ def test_the_policy_of_evaluation_is_the_mapped_mean(name, gsde):
     wanted = []
     for i in range(len(SEEDS)):
         raw = mlp(agent.actor, i, obs[i]) if name in TD3_NAMES else moments(agent, agent.actor, i, obs[i])[0]
-        mapping = {"project": CONSTRAINT.project, "alpha": CONSTRAINT.alpha_map, "radial": CONSTRAINT.radial_map}
-        wanted.append(mapping[map_of(agent)](obs[i], raw.tanh() if map_of(agent) == "project" else raw).detach())
+        wanted.append(mapped(agent, obs[i], raw.tanh() if squashes(agent) else raw).detach())
     torch.testing.assert_close(agent.policy([0, 1])(obs), torch.stack(wanted))
     for _ in range(2):
         torch.testing.assert_close(act(obs[1:]), wanted[1].unsqueeze(0))
@@ -462,17 +458,15 @@ def test_exploration_adds_noise_before_the_map(name):
     agent, obs = make_agent(name, **({"action_noise": 0.7} if name in TD3_NAMES else {})), make_batch().obs[:, 0]
     noise = Streams(SEEDS, "explore")
     for only in ([0, 1], [1], [0, 1]):
-        found, drawn = agent.explore(obs, only), noise.normal(DIM, only=only)
+        found, drawn = agent.explore(obs, only), noise.normal(DIM, which=only)
         for i in only:
             if name in TD3_NAMES:
                 raw = mlp(agent.actor, i, obs[i : i + 1])[0]
-                wanted = (
-                    (raw.tanh() + 0.7 * drawn[i]).clamp(-1, 1) if map_of(agent) == "project" else raw + 0.7 * drawn[i]
-                )
+                wanted = (raw.tanh() + 0.7 * drawn[i]).clamp(-1, 1) if squashes(agent) else raw + 0.7 * drawn[i]
             else:
                 mean, std, _ = moments(agent, agent.actor, i, obs[i : i + 1])
                 wanted = (mean + std * drawn[i])[0]
-                wanted = wanted.tanh() if map_of(agent) == "project" else wanted
+                wanted = wanted.tanh() if squashes(agent) else wanted
             torch.testing.assert_close(found[i], wanted.detach())
 
 
@@ -481,11 +475,11 @@ def test_executed_and_warm_up_actions_are_feasible(name):
     """The algorithm's own map makes the executed action; warm-up takes one that leaves feasible actions alone."""
     agent, obs = make_agent(name), make_batch().obs
     suggested = 3 * torch.randn(obs.shape[:-1] + (DIM,), generator=torch.Generator().manual_seed(1))
-    mapping = {"project": CONSTRAINT.project, "alpha": CONSTRAINT.alpha_map, "radial": CONSTRAINT.radial_map}
-    assert torch.equal(agent.feasible(obs, suggested, None), mapping[map_of(agent)](obs, suggested))
-    pulled = mapping["project" if map_of(agent) == "project" else "alpha"](obs, suggested)
-    assert torch.equal(agent.pull_back(obs, suggested, None), pulled)
-    torch.testing.assert_close(agent.pull_back(obs, pulled, None), pulled)
+    suggested = suggested.tanh() if squashes(agent) else suggested
+    assert torch.equal(agent.feasible(obs, suggested, None), mapped(agent, obs, suggested))
+    pulled = (CONSTRAINT.project if map_of(agent) == "project" else CONSTRAINT.alpha_map)(obs, suggested)
+    assert torch.equal(agent.map.pull_back(CONSTRAINT, obs, suggested, None), pulled)
+    torch.testing.assert_close(agent.map.pull_back(CONSTRAINT, obs, pulled, None), pulled)
     warm = torch.stack([agent.warm_up([0, 1]) for _ in range(200)])
     assert torch.equal(warm[0], Streams(SEEDS, "explore").uniform(DIM))
     assert (warm.amax((0, 1)) > 0.9).all() and (warm.amin((0, 1)) < -0.9).all() and warm.abs().max() <= 1

@@ -156,8 +156,8 @@ def test_a_parameter_that_no_loss_shows_is_found_before_it_is_evaluated(tmp_path
 def test_an_action_that_is_not_finite(tmp_path, monkeypatch, algo):
     explore = ALGORITHMS[algo].agent.explore
 
-    def spoiled(self, obs, only):
-        suggested = explore(self, obs, only)
+    def spoiled(self, obs, which):
+        suggested = explore(self, obs, which)
         if self.updates == MOMENT:
             suggested[BAD] = math.nan
         return suggested
@@ -165,14 +165,14 @@ def test_an_action_that_is_not_finite(tmp_path, monkeypatch, algo):
     monkeypatch.setattr(ALGORITHMS[algo].agent, "explore", spoiled)
     assert run_command([*f"algo={algo} env=R+L2 {WORDS}".split(), f"results={tmp_path}"]) == 3
     ((name, failure),) = failures(tmp_path).items()
-    assert name == "seed=5" and failure["quantity"] == "suggested action [nan, nan] is not finite"
+    assert name == "seed=5" and failure["quantity"] == "action [nan, nan] is not finite"
 
 
 def test_a_seed_that_fails_at_its_first_step(tmp_path, monkeypatch):
     warm_up = ALGORITHMS["DPre"].agent.warm_up
 
-    def spoiled(self, only):
-        suggested = warm_up(self, only)
+    def spoiled(self, which):
+        suggested = warm_up(self, which)
         suggested[BAD] = math.inf
         return suggested
 

@@ -55,7 +55,7 @@ def one_by_one(task, act):
 @pytest.mark.parametrize("task", ["R+L2", "W+M"])  # (walkers fall, each after a number of steps of its own)
 @pytest.mark.parametrize("spoiled", [None, 1])
 def test_episodes_stepped_together_return_what_single_steps_do(task, spoiled):
-    evaluator = Evaluator(lambda: envs.make(task), SEEDS, EPISODES, check=lambda: None)
+    evaluator = Evaluator(lambda: envs.make(task), SEEDS, EPISODES, envs.step_together, stop_if_asked=lambda: None)
     returns = evaluator.run(policy(task, spoiled), range(len(SEEDS)), EPISODES)
     wanted, robots, refused = one_by_one(task, policy(task, spoiled))
     np.testing.assert_array_equal(returns, wanted)

@@ -18,8 +18,8 @@ import pytest
 import torch
 from helpers import Breaks, assert_identical, outcome, run_command, train, train_through
 
-from core import config
-from core.replay import Replay
+from algos.td3 import TD3
+from core.replay import Batch, Replay
 from store import folder as results
 from store.checkpoint import Checkpoint, CheckpointFolder, group_checkpoints
 from store.interrupt import Interrupted, Interrupts
@@ -165,7 +165,7 @@ def test_replay_files_hold_each_transition_once_and_go_when_it_is_overwritten(tm
     folder, replay = CheckpointFolder(tmp_path), Replay([1, 2], 50, obs_dim=2, action_dim=1, centers=False)
     kept_files = []
     for number in range(130):
-        replay.add([1], *(torch.full((2, width), float(number)) for width in replay.widths))
+        replay.add([1], Batch(*(torch.full((2, width), float(number)) for width in replay.widths)))
         if number % 20 == 19:
             stored = partial(replay.stretch, 1), max(0, replay.added[1] - 50), replay.added[1]
             folder.write("moment", (2,), number, {}, {"number": number}, *stored)
@@ -201,7 +201,7 @@ def test_checkpoints_after_a_resumption_join_those_before_it(tmp_path):
 
 def test_settings_that_changed_are_not_mixed(tmp_path, capsys, monkeypatch):
     folder, _ = break_off(tmp_path)
-    monkeypatch.setitem(config.HYPERPARAMETERS["Reacher", "TD3"], "tau", 0.5)
+    monkeypatch.setitem(TD3.paper["Reacher"], "tau", 0.5)
     capsys.readouterr()
     assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 2
     err = capsys.readouterr().err

@@ -11,12 +11,13 @@ import pytest
 import torch
 from helpers import cells_of, config_of, run_command
 
-import core.graph
+import core.cuda_graph
 import envs
 from algos import ALGORITHMS
 from constraints import LinearConstraint
-from core.graph import EAGER_STEPS, GradientSteps, Tape
-from core.replay import Replay
+from core.cuda_graph import EAGER_STEPS, GradientSteps
+from core.random import Tape
+from core.replay import Batch, Replay
 from store.folder import read_run
 from store.interrupt import Interrupted
 from sweep.train import train as train_cell
@@ -38,11 +39,11 @@ def make(name, task="W+M", device="cpu"):
     def grow(count):
         for _ in range(count):
             obs, next_obs = (torch.randn(2, agent.obs_dim, generator=generator) for _ in range(2))
-            action = agent.pull_back(obs, torch.rand(2, agent.action_dim, generator=generator) * 2 - 1, None)
-            columns = [obs, action, torch.randn(2, 1, generator=generator), torch.zeros(2, 1), next_obs]
-            if agent.stores_centers:
-                columns += [constraint.center(obs), constraint.center(next_obs)]
-            replay.add([0, 1], *columns)
+            uniform = torch.rand(2, agent.action_dim, generator=generator) * 2 - 1
+            action = agent.map.pull_back(constraint, obs, uniform, None)
+            reward, terminated = torch.randn(2, 1, generator=generator), torch.zeros(2, 1)
+            centers = agent.centers(obs), agent.centers(next_obs)
+            replay.add([0, 1], Batch(obs, action, reward, terminated, next_obs, *centers))
 
     grow(20)
     return agent, replay, grow
@@ -82,7 +83,7 @@ def cuda_stand_in(monkeypatch):
     class Device:
         type = "cuda"
 
-    class Captured(core.graph.CapturedStep):
+    class Captured(core.cuda_graph.CapturedStep):
         def __init__(self, agent, step, tape):
             def again():
                 tape.rewind()
@@ -127,7 +128,7 @@ def cuda_stand_in(monkeypatch):
                 self._step()
 
     monkeypatch.setattr(torch.cuda, "CUDAGraph", FakeGraph)
-    monkeypatch.setattr(core.graph, "CapturedStep", Captured)
+    monkeypatch.setattr(core.cuda_graph, "CapturedStep", Captured)
     return Steps
 
 

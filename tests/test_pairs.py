@@ -7,7 +7,6 @@ import torch
 from helpers import run_command
 
 from algos import ALGORITHMS
-from core.config import parse_seeds
 from envs import TASKS
 from sweep import train
 
@@ -17,7 +16,7 @@ SHORT = ["learning_starts=20", "batch_size=8", "hidden=[16,16]", "eval_episodes=
 def settings(algo, task):
     """A short run with gradient steps: where TD3 waits for the end of an episode, one that ends soon or none."""
     robot = TASKS[task].robot.__name__
-    if ALGORITHMS[algo].base == "SAC" or robot == "Hopper":
+    if ALGORITHMS[algo].agent.family == "SAC" or robot == "Hopper":
         return {"steps": 40}
     # An episode of HalfCheetah is 1,000 steps: too long for thirteen algorithms twice.
     return {"HalfCheetah": {"steps": 40, "train_freq": 10}, "Reacher": {"steps": 151}, "Walker2d": {"steps": 120}}[
@@ -51,7 +50,7 @@ def test_pair(tmp_path, capsys, monkeypatch, algo, task):
     assert last.keys() == fresh.keys()
     modules = {name.split(".")[0] for name in last}
     assert {"actor", "critic", "critic_target"} <= modules and ("actor_target" in modules) == (
-        ALGORITHMS[algo].base == "TD3"
+        ALGORITHMS[algo].agent.family == "TD3"
     )
     for module in modules:
         names = [name for name in last if name.startswith(f"{module}.")]
@@ -65,7 +64,7 @@ def test_every_executed_action_is_counted(tmp_path):
     """The counts of training and evaluation environments add up: nothing is executed unchecked."""
     words = ["algo=DPre", "env=R+M", "seed=0-1", "steps=150", f"results={tmp_path}", *SHORT]
     assert run_command([*words, "eval_every=50"]) == 0
-    for seed in parse_seeds("0-1"):
+    for seed in (0, 1):
         (path,) = tmp_path.glob(f"*/*/seed={seed}/result.json")
         # 150 training steps, three evaluations and the final one of an episode each
         assert json.loads(path.read_text())["executed_actions"] == 150 + (3 + 1) * 150

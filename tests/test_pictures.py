@@ -16,7 +16,7 @@ from helpers import refused_by_plot, run_command
 import envs
 import plot
 import tables
-from core.config import HYPERPARAMETERS
+from algos import ALGORITHMS
 from plots import definitions, illustrations, runtime
 from store.folder import read_run
 
@@ -129,13 +129,15 @@ def test_task_table():
 def test_hyperparameter_table():
     table = definitions.hyperparameter_table()
     values = {(r["setting"], r["robot"], r["base"]): r["value"] for r in table.records}
-    for (robot, base), settings in HYPERPARAMETERS.items():
-        for key, value in settings.items():
-            assert values[key, robot, base] == value
+    agents = [algorithm.agent for algorithm in ALGORITHMS.values()]
+    for agent in agents:
+        for robot, settings in agent.paper.items():
+            for key, value in settings.items():
+                assert values[key, robot, agent.family] == value
     assert values["action_noise", "Others", "SAC"] is None and values["policy_delay", "Hopper", "TD3"] == 2
     assert values["penalty", "Reacher", "SAC"] == 1.0 and values["final_episodes", "Hopper", "TD3"] == 50
     published, further = ({row[0].lines[0]: [cell.lines[0] for cell in row] for row in s} for s in table.sections)
-    assert set(published) == {key for settings in HYPERPARAMETERS.values() for key in settings}
+    assert set(published) == {key for agent in agents for settings in agent.paper.values() for key in settings}
     assert "policy_delay" in further and not {"seed", "results", "steps"} & set(further)
     assert published["hidden"][2:] == ["400, 300"] * 3 + ["256, 256", "400, 300", "256, 256"]
     assert published["gsde"][2:] == ["–", "True", "–", "False", "–", "False"]

@@ -4,21 +4,21 @@ import pytest
 import torch
 
 from core.random import PURPOSES, Streams
-from core.replay import Replay
+from core.replay import Batch, Replay
 
 
 def numbered(seeds, number, centers=True):
-    """Columns of transition `number`: seed i's obs is 100 i + number, and every other column tells the same number."""
+    """Transition `number`: seed i's obs is 100 i + number, and every other column tells the same number."""
     value = torch.arange(seeds).unsqueeze(1) * 100.0 + number
     columns = [torch.cat([value, -value], 1), value + 0.1, value + 0.2, value % 2, torch.cat([value + 0.3] * 2, 1)]
-    return [*columns, value + 0.4, value + 0.5] if centers else columns
+    return Batch(*columns, *([value + 0.4, value + 0.5] if centers else []))
 
 
 def filled(seeds, counts, capacity, centers=True):
     replay = Replay(seeds, capacity, obs_dim=2, action_dim=1, centers=centers)
     for number in range(max(counts)):
         which = [i for i, count in enumerate(counts) if number < count]
-        replay.add(which, *numbered(len(seeds), number, centers))
+        replay.add(which, numbered(len(seeds), number, centers))
     return replay
 
 
@@ -63,7 +63,7 @@ def test_a_seed_samples_the_same_alone_and_among_others():
     together = filled([1, 3, 8], counts=[17, 12, 2], capacity=10)
     alone = Replay([3], 10, obs_dim=2, action_dim=1, centers=True)
     for number in range(12):
-        alone.add([0], *(column[1:2] for column in numbered(3, number)))
+        alone.add([0], Batch(*(column[1:2] for column in numbered(3, number))))
     for _ in range(3):
         for column, lone in zip(together.sample(20), alone.sample(20), strict=True):
             assert torch.equal(column[1:2], lone)
@@ -74,7 +74,7 @@ def test_streams_draw_what_each_seed_alone_would(draw):
     together, lone = Streams([1, 3, 8], "explore"), Streams([3], "explore")
     # While seed 3 draws three times, its neighbours draw at times of their own.
     for only in ([0, 1, 2], [1], [1, 2]):
-        drawn = getattr(together, draw)(4, 2, only=only)
+        drawn = getattr(together, draw)(4, 2, which=only)
         assert torch.equal(drawn[1], getattr(lone, draw)(4, 2)[0])
         for i in {0, 1, 2} - set(only):
             assert not drawn[i].any()

@@ -25,7 +25,7 @@ def run(words, *program):
 def test_a_simulator_that_the_robot_does_not_have_is_one_line():
     for words, said in (
         ("env=R+N simulator=mujoco", "unknown simulator 'mujoco' for R+N (choices: closed-form pybullet)"),
-        ("env=W+M simulator=pybullet", "simulator does not apply to W+M"),
+        ("env=W+M simulator=pybullet", "simulator does not apply to DPre on W+M"),
     ):
         done = run(f"algo=DPre {words}")
         assert (done.returncode, done.stdout, done.stderr) == (2, "", f"run.py: {said}\n")

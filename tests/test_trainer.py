@@ -9,28 +9,26 @@ import pytest
 import torch
 from torch import nn
 
-import core.evaluation
-import core.trainer
+import core.moments
 from algos import ALGORITHMS
 from constraints import WeightedPositivePart
 from core.agent import Agent
-from core.config import Config, defaults
+from core.config import Config, ConfigError
+from core.maps import Alpha
 from core.random import Streams
 from core.trainer import Trainer
+from store.checkpoint import CheckpointFolder
 from store.folder import RunWriter, is_finished, read_run
+from store.interrupt import Interrupted
 
 OBS, DIM = 3, 2
 LENGTHS = (5, 7)  # of every other episode; the shorter ones terminate, the longer ones are cut off
 CONSTRAINT = WeightedPositivePart(lambda obs: obs[..., :DIM] + 1.0, 0.5, DIM)
 
 
-@pytest.fixture(autouse=True)
-def scripted_steps(monkeypatch):
+def step_together(envs, actions):
     """Scripted environments check no action and step by themselves."""
-    for module in (core.trainer, core.evaluation):
-        monkeypatch.setattr(
-            module, "step_together", lambda envs, actions: [env.step(a) for env, a in zip(envs, actions, strict=True)]
-        )
+    return [env.step(action) for env, action in zip(envs, actions, strict=True)]
 
 
 class Scripted(gymnasium.Env):
@@ -80,10 +78,12 @@ class Counter(Agent):
     """Its one parameter a seed counts gradient steps; its policy's reward is the score of that number."""
 
     def __init__(self, config, seeds, scores=()):
-        super().__init__(config, CONSTRAINT, OBS, seeds, mapping="alpha", placement="layer")
-        self.net = nn.Module()
-        self.net.count = nn.Parameter(torch.zeros(len(seeds), 1))
+        super().__init__(config, CONSTRAINT, OBS, seeds, map=Alpha(), placement="layer")
         self.scores, self.rollouts, self.trainer = scores, [], None
+
+    def build(self, init):
+        self.net = nn.Module()
+        self.net.count = nn.Parameter(torch.zeros(len(self.seeds), 1))
 
     def networks(self):
         return {"net": self.net}
@@ -91,7 +91,7 @@ class Counter(Agent):
     def optimizers(self):
         return {}
 
-    def explore(self, obs, only):
+    def explore(self, obs, which):
         return torch.full((len(self.seeds), DIM), 0.01)
 
     def policy(self, which: Sequence[int]):
@@ -108,8 +108,8 @@ class Counter(Agent):
         with torch.no_grad():
             self.net.count += 1
 
-    def start_rollout(self, only):
-        self.rollouts += [(i, self.trainer.steps[i]) for i in only]
+    def start_rollout(self, which):
+        self.rollouts += [(i, self.trainer.seeds[i].steps) for i in which]
 
 
 def make_trainer(tmp_path, seeds=(4,), scores=(), agent=None, fail=None, fail_in_evaluation=None, **settings):
@@ -125,6 +125,7 @@ def make_trainer(tmp_path, seeds=(4,), scores=(), agent=None, fail=None, fail_in
         agent,
         [Scripted(fail) for _ in seeds],
         lambda: Scripted(fail_in_evaluation),
+        step_together,
         writers,
         progress=False,
     )
@@ -133,7 +134,7 @@ def make_trainer(tmp_path, seeds=(4,), scores=(), agent=None, fail=None, fail_in
 
 
 def folder(trainer, i=0):
-    return trainer.writers[i].folder
+    return trainer.seeds[i].writer.folder
 
 
 def saved_count(trainer, name, i=0):
@@ -233,16 +234,16 @@ def test_a_later_evaluation_that_is_nan_is_not_best(tmp_path):
 @pytest.mark.parametrize(
     "train_freq, gradient_steps, learning_starts, wanted",
     [
-        ("8", 8, 10, 5 * 8),  # after the steps 16, 24, 32, 40, 48
-        ("8", 8, 16, 4 * 8),  # a rollout that ends with the warm-up is still warm-up
-        ("8", 3, 10, 5 * 3),
-        ("8", -1, 10, 5 * 8),
-        ("1", 1, 10, 39),  # after the steps 11 to 49: the run ends with step 50
-        ("1", 2, 0, 49 * 2),
+        (8, 8, 10, 5 * 8),  # after the steps 16, 24, 32, 40, 48
+        (8, 8, 16, 4 * 8),  # a rollout that ends with the warm-up is still warm-up
+        (8, 3, 10, 5 * 3),
+        (8, -1, 10, 5 * 8),
+        (1, 1, 10, 39),  # after the steps 11 to 49: the run ends with step 50
+        (1, 2, 0, 49 * 2),
         ("episode", -1, 10, 7 + 5 + 7 + 5 + 7 + 5 + 7),  # episodes end at 5, 12, 17, 24, 29, 36, 41 and 48
         ("episode", -1, 12, 5 + 7 + 5 + 7 + 5 + 7),
         ("episode", 2, 10, 7 * 2),
-        ("1", 1, 50, 0),
+        (1, 1, 50, 0),
     ],
 )
 def test_the_number_of_gradient_steps(tmp_path, train_freq, gradient_steps, learning_starts, wanted):
@@ -254,7 +255,7 @@ def test_the_number_of_gradient_steps(tmp_path, train_freq, gradient_steps, lear
 
 
 @pytest.mark.parametrize(
-    "train_freq, starts", [("8", [0, 8, 16, 24, 32, 40, 48]), ("episode", [0, 5, 12, 17, 24, 29, 36, 41, 48])]
+    "train_freq, starts", [(8, [0, 8, 16, 24, 32, 40, 48]), ("episode", [0, 5, 12, 17, 24, 29, 36, 41, 48])]
 )
 def test_the_agent_hears_of_every_rollout(tmp_path, train_freq, starts):
     trainer = make_trainer(tmp_path, seeds=(4, 6), train_freq=train_freq, gradient_steps=2)
@@ -266,7 +267,7 @@ def test_the_agent_hears_of_every_rollout(tmp_path, train_freq, starts):
 def test_warm_up_actions_then_exploration(tmp_path):
     trainer = make_trainer(tmp_path)
     trainer.run()
-    executed = np.stack(trainer.envs[0].executed)
+    executed = np.stack(trainer.seeds[0].env.executed)
     assert executed.shape == (50, DIM)
     stream = Streams([4], "explore")
     obs, center = (transitions(trainer)[k] for k in (0, 5))
@@ -279,11 +280,11 @@ def test_warm_up_actions_then_exploration(tmp_path):
 # ---------------------------------------------------------------- what is stored
 
 
-@pytest.mark.parametrize("train_freq", ["1", "episode"])
+@pytest.mark.parametrize("train_freq", [1, "episode"])
 def test_stored_transitions(tmp_path, train_freq):
     trainer = make_trainer(tmp_path, seeds=(4, 6), train_freq=train_freq)
     trainer.run()
-    for i, env in enumerate(trainer.envs):
+    for i, env in enumerate(seed.env for seed in trainer.seeds):
         obs, action, reward, terminated, next_obs, center, next_center = transitions(trainer, i)
         assert len(obs) == 50
         wanted, t, episode = [], 0, 0
@@ -304,18 +305,16 @@ def test_stored_transitions(tmp_path, train_freq):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_the_buffer_has_suggestions_where_the_environment_maps_and_executed_actions_elsewhere(tmp_path, name):
     algorithm = ALGORITHMS[name]
-    config = defaults(
-        name, "Scripted", "Hopper", algorithm.base, algorithm.mapping, name == "NFW", algorithm.penalty, steps=40
-    )
+    config = algorithm.paper_config(name, "Scripted", "Hopper", steps=40)
     config.hidden, config.learning_starts, config.batch_size, config.eval_every = [8, 8], 20, 4, 40
     config.eval_episodes = config.final_episodes = 1
-    if config.action_noise:
+    if name.startswith("D") or name == "NFW":
         config.action_noise = 1.0
-    agent = algorithm.agent(config, CONSTRAINT, OBS, [4], mapping=algorithm.mapping, placement=algorithm.placement)
+    agent = algorithm.build(config, CONSTRAINT, OBS, [4])
     trainer = make_trainer(tmp_path, agent=agent)
     trainer.run()
     obs, stored, *_ = transitions(trainer)
-    executed = torch.from_numpy(np.stack(trainer.envs[0].executed))
+    executed = torch.from_numpy(np.stack(trainer.seeds[0].env.executed))
     assert CONSTRAINT.violation(obs, executed).max() <= 1e-6
     if name in ("DPre", "DPre+", "SPre", "SPre+"):
         for part in (slice(0, 20), slice(20, 40)):  # warm-up, training
@@ -344,7 +343,7 @@ def test_an_exception_saves_the_parameters_and_closes_everything(tmp_path):
         assert saved_count(trainer, "last", i) == 20  # after the steps 11 to 30
         assert saved_count(trainer, "best", i) == 9
         assert not is_finished(folder(trainer, i)) and read_run(folder(trainer, i)).evaluations.step.tolist() == [20]
-    assert all(env.closed for env in trainer.envs)
+    assert all(seed.env.closed for seed in trainer.seeds)
     assert all(env.closed for i in range(2) for env in trainer.evaluator.of_seed(i))
 
 
@@ -364,12 +363,12 @@ def test_an_interrupt_during_the_final_evaluation_keeps_the_last_parameters(tmp_
 
 def test_a_failure_leaves_finished_seeds_as_they_are(tmp_path):
     def fail(env):
-        if env is trainer.envs[0] and env.executed_actions == 41:
+        if env is trainer.seeds[0].env and env.executed_actions == 41:
             raise BrokenError
 
     trainer = make_trainer(tmp_path, seeds=(4, 6), fail=fail, steps=42, train_freq="episode", gradient_steps=-1)
     # The second seed's first episode has 7 steps: its last one ends after the run, at 43, the first one's at 41.
-    trainer.envs[1].episode = 0
+    trainer.seeds[1].env.episode = 0
     with pytest.raises(BrokenError):
         trainer.run()
     assert not is_finished(folder(trainer, 0)) and saved_count(trainer, "last", 0) == 7 + 5 + 7 + 5 + 7 + 5
@@ -389,14 +388,14 @@ def test_one_folder_that_cannot_be_written_costs_only_its_own_parameters(tmp_pat
             raise BrokenError
 
     trainer = make_trainer(tmp_path, seeds=(4, 6, 8), fail=fail)
-    save = trainer.writers[1].save_parameters
+    save = trainer.seeds[1].writer.save_parameters
 
     def no_space_for_the_last(name, parameters):
         if name == "last":
             raise OSError(errno.ENOSPC, "No space left on device")
         save(name, parameters)
 
-    trainer.writers[1].save_parameters = no_space_for_the_last
+    trainer.seeds[1].writer.save_parameters = no_space_for_the_last
     with pytest.raises(BrokenError):
         trainer.run()
     assert "last parameters not saved" in capsys.readouterr().err
@@ -440,3 +439,23 @@ def test_an_algorithm_without_statistics_leaves_no_table(tmp_path):
     trainer = make_trainer(tmp_path)
     trainer.run()
     assert not (folder(trainer) / "training.csv").exists()
+
+
+def test_a_checkpoint_of_another_version_is_refused_with_a_clear_message(tmp_path, monkeypatch):
+    def stop():
+        if trainer.seeds[0].steps == 30:
+            raise Interrupted(15)
+
+    trainer = make_trainer(tmp_path)
+    trainer.stop_if_asked = stop
+    with pytest.raises(Interrupted):
+        trainer.run()
+    (checkpoint,), _ = CheckpointFolder(folder(trainer)).read()
+    again = make_trainer(tmp_path / "again")
+    again.restore([checkpoint])
+    assert again.seeds[0].steps == 30 and again.agent.net.count.item() == 20 - 1
+    monkeypatch.setattr(core.moments, "STATE_FORMAT", 99)
+    refused = make_trainer(tmp_path / "refused")
+    with pytest.raises(ConfigError, match="another version of this program.*overwrite=true"):
+        refused.restore([checkpoint])
+    assert refused.seeds[0].steps == 0

@@ -1,7 +1,7 @@
 """Gradient steps as CUDA graphs: the hundreds of kernels of a step are launched at once, without Python in between.
 
-A graph repeats its operations on the same memory. What differs from step to step are the random numbers: they are drawn
-on the CPU, from each seed's own streams, just as without a GPU, and copied to where the graph reads them.
+A graph repeats its operations on the same memory. Only the random numbers differ from step to step. They are drawn on
+the CPU, from each seed's own streams, as without a GPU, and copied to where the graph reads them (`core.random.Tape`).
 """
 
 from __future__ import annotations
@@ -10,45 +10,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
-from torch import Tensor
 
 from core.agent import Agent
+from core.random import Tape
 from core.replay import Replay
 
 EAGER_STEPS = 3
-"""Steps of each kind taken before one is captured: libraries allocate what they need when first called."""
-
-
-class Tape:
-    """The draws of one gradient step in their order, each with the tensor on the device that holds its numbers.
-
-    First it records; after `rewind` it hands out the same tensors again, in the same order, and draws nothing.
-    """
-
-    def __init__(self) -> None:
-        self.entries: list[tuple[Callable[[], Tensor], Tensor]] = []
-        self.position: int | None = None
-
-    def deliver(self, draw: Callable[[], Tensor], device: torch.device) -> Tensor:
-        """The numbers of `draw()` on the `device`."""
-        if self.position is None:
-            self.entries.append((draw, draw().to(device)))
-            return self.entries[-1][1]
-        self.position += 1
-        return self.entries[self.position - 1][1]
-
-    def rewind(self) -> None:
-        self.position = 0
-
-    def draw_again(self) -> None:
-        """New numbers from the streams, into the same tensors; the device is not waited for."""
-        for draw, numbers in self.entries:
-            drawn = draw()
-            numbers.copy_(drawn.pin_memory() if numbers.is_cuda else drawn, non_blocking=True)
+"""Steps of each kind before one is captured: libraries allocate memory when they are first called."""
 
 
 class CapturedStep:
-    """A gradient step of `agent`, captured but not taken, that can be repeated; `tape` is of an earlier one."""
+    """A gradient step of `agent`, captured but not taken, that can be repeated. `tape` is from an earlier step."""
 
     def __init__(self, agent: Agent, step: Callable[[], None], tape: Tape):
         self.agent, self.tape = agent, tape
@@ -71,8 +43,8 @@ class CapturedStep:
 class GradientSteps:
     """Calling it takes one gradient step of every seed of `agent`, on a batch from `replay`.
 
-    On a GPU the first steps of each of the agent's kinds are taken one operation after the other, later ones as graphs,
-    and no call waits for the GPU. Only sets that are solved on the CPU cannot be part of a graph.
+    On a GPU it takes the first steps of each of the agent's kinds operation by operation and repeats later ones as
+    graphs. No call waits for the GPU. Sets that are solved on the CPU cannot be part of a graph.
     """
 
     def __init__(self, agent: Agent, replay: Replay, batch_size: int):
@@ -99,7 +71,7 @@ class GradientSteps:
         self.agent.update(self.replay.sample(self.batch_size))
 
     def _step_aside(self, kind: int) -> None:
-        """An eager step on a stream of its own, as capturing asks for; its draws are recorded."""
+        """An eager step on a stream of its own, as capturing demands, that records its draws."""
         self.tapes[kind] = Tape()
         stream = torch.cuda.Stream(self.agent.device)
         stream.wait_stream(torch.cuda.current_stream(self.agent.device))

@@ -1,0 +1,166 @@
+"""Feasibility maps: how the action that an actor suggests becomes an action inside the feasible set.
+
+A new map is one class. It needs `__call__`; with `with_log_prob` it serves SAC as well as TD3. Its dataclass fields,
+made with `core.config.setting`, are keys of the command line for the algorithms that use the map.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal, NamedTuple
+
+from torch import Tensor
+
+from constraints import Constraint
+from core.config import NOT_NEGATIVE, POSITIVE, one_of, setting
+
+Placement = Literal["environment", "rollout", "layer"]
+"""Where a map stands between the actor and the robot: see `core.agent.Agent`."""
+
+
+class Sample(NamedTuple):
+    """Suggestions (..., d) that a stochastic actor has drawn.
+
+    `mean` and `std` (..., d) are those of the actor's normal distribution, which is before the tanh where there is one.
+    `log_prob` (...) is the log-density of `suggested` itself.
+    """
+
+    suggested: Tensor
+    mean: Tensor
+    std: Tensor
+    log_prob: Tensor
+
+
+@dataclass
+class Map(ABC):
+    """A map into the feasible set.
+
+    Tensors are obs (..., n), actions and `center` (..., d). `center` is an interior point of the set at `obs`; it is
+    None where the agent has none at hand, and then the constraint computes its own.
+    """
+
+    squashes: ClassVar[bool] = False
+    """Whether a tanh keeps suggestions in the box [-1, 1]^d before they reach the map."""
+    needs_center: ClassVar[bool] = True
+    """Whether the map uses a centre. The agent then computes it once a transition and replays it."""
+    placements: ClassVar[tuple[Placement, ...]] = ("layer",)
+    """The placements in which the map makes sense. The other two ask more of a map than "layer". Random actions are
+    suggestions there, so `pull_back` must be the map itself. Critics score suggestions as well as feasible actions, so
+    the map must leave feasible actions alone, and suggestions must stay in the box."""
+
+    @abstractmethod
+    def __call__(self, constraint: Constraint, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
+        """The feasible action (..., d), differentiable in `suggested`."""
+
+    def with_log_prob(
+        self, constraint: Constraint, obs: Tensor, sample: Sample, center: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """The feasible actions (..., d) of a sample's suggestions, and their log-densities (...). SAC needs it."""
+        raise NotImplementedError(f"{type(self).__name__} has no log-density")
+
+    def pull_back(self, constraint: Constraint, obs: Tensor, action: Tensor, center: Tensor | None) -> Tensor:
+        """Map a random action (..., d) to a feasible one and leave feasible actions alone."""
+        return constraint.alpha_map(obs, action, center)
+
+    def limit_target(self, constraint: Constraint, obs: Tensor, action: Tensor, center: Tensor | None) -> Tensor:
+        """Put a target action (..., d), to which TD3 has added noise, back where the critic knows actions."""
+        return self.pull_back(constraint, obs, action, center)
+
+    def stores_centers(self, constraint: Constraint) -> bool:
+        """Whether the replay buffer has two centres a transition. The origin needs no storing."""
+        return self.needs_center and not constraint.origin_centered
+
+    @classmethod
+    def has_log_prob(cls) -> bool:
+        """Whether SAC can use the map as a layer."""
+        return cls.with_log_prob is not Map.with_log_prob
+
+
+@dataclass
+class Project(Map):
+    """Closest-point projection (paper, Section "Algorithms Based on the Closest Point Projection")."""
+
+    squashes = True
+    needs_center = False
+    placements = ("environment", "rollout", "layer")
+
+    def __call__(self, constraint: Constraint, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
+        return constraint.project(obs, suggested)
+
+    def pull_back(self, constraint: Constraint, obs: Tensor, action: Tensor, center: Tensor | None) -> Tensor:
+        return constraint.project(obs, action)
+
+    def limit_target(self, constraint: Constraint, obs: Tensor, action: Tensor, center: Tensor | None) -> Tensor:
+        return action.clamp(-1.0, 1.0)
+
+
+@dataclass
+class RayMap(Map):
+    """A map along rays from the centre, with the setting of SAC's entropy that all of these have."""
+
+    entropy: str = setting(
+        "paper",
+        "SAlpha, SRad, SGauge: entropy of actions as in the 'paper', or in unit-'ball' coordinates",
+        one_of("paper", "ball"),
+        of_density=True,
+    )
+
+    @property
+    def unit_ball(self) -> bool:
+        return self.entropy == "ball"
+
+
+@dataclass
+class Alpha(RayMap):
+    """alpha-projection (paper, Section "Other Mapping Techniques")."""
+
+    boundary_weight: float = setting(
+        1.0, "SAlpha: weight of the boundary's measure in the entropy", POSITIVE, of_density=True
+    )
+
+    def __call__(self, constraint: Constraint, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
+        return constraint.alpha_map(obs, suggested, center)
+
+    def with_log_prob(
+        self, constraint: Constraint, obs: Tensor, sample: Sample, center: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        ray = constraint.ray(obs, sample.suggested, center)
+        return ray.alpha_map(), ray.alpha_log_prob(sample.mean, sample.std, self.unit_ball, self.boundary_weight)
+
+
+@dataclass
+class Radial(RayMap):
+    """Radial squashing (paper, Section "Other Mapping Techniques")."""
+
+    log_det_floor: float = setting(
+        0.0,
+        "SRad: added to the determinant in the density (released code: 1e-6)",
+        NOT_NEGATIVE,
+        of_density=True,
+    )
+
+    def __call__(self, constraint: Constraint, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
+        return constraint.radial_map(obs, suggested, center)
+
+    def with_log_prob(
+        self, constraint: Constraint, obs: Tensor, sample: Sample, center: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        ray = constraint.ray(obs, sample.suggested, center)
+        return ray.radial_map(), ray.radial_log_prob(sample.log_prob, self.unit_ball, self.log_det_floor)
+
+
+@dataclass
+class Gauge(RayMap):
+    """The gauge map (Tabas and Zhang, 2022): it scales the box onto the set, ray by ray."""
+
+    squashes = True
+
+    def __call__(self, constraint: Constraint, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
+        return constraint.gauge_map(obs, suggested, center)
+
+    def with_log_prob(
+        self, constraint: Constraint, obs: Tensor, sample: Sample, center: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        ray = constraint.ray(obs, sample.suggested, center)
+        return ray.gauge_map(), ray.gauge_log_prob(sample.log_prob, self.unit_ball)

@@ -1,0 +1,96 @@
+"""The moments of a training from which it can go on: a checkpoint of every seed, written and taken up together."""
+
+from __future__ import annotations
+
+import sys
+import uuid
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+
+from core.agent import Agent
+from core.config import ConfigError
+from core.evaluation import Evaluator
+from core.progress import PhaseTimer
+from core.replay import Replay
+from core.seed import Seed
+from store.checkpoint import Checkpoint
+from store.files import one_line
+
+STATE_FORMAT = 2
+"""Version of what a checkpoint's state holds. A checkpoint of another version is refused."""
+
+
+class Moments:
+    """Writes and restores everything that the future of `seeds` depends on."""
+
+    def __init__(self, seeds: Sequence[Seed], agent: Agent, replay: Replay, evaluator: Evaluator, timer: PhaseTimer):
+        self.seeds, self.agent, self.replay = seeds, agent, replay
+        self.evaluator, self.timer = evaluator, timer
+
+    def write(self, obs: Tensor, center: Tensor | None) -> None:
+        """Write a checkpoint of every seed; obs (seeds, n) and `center` (seeds, d) are the present ones.
+
+        Where that fails, report it and keep the one before.
+        """
+        moment = uuid.uuid4().hex
+        try:
+            for seed in self.seeds:
+                content = self.agent.seeds, seed.steps, seed.writer.config, self._state(seed, obs, center)
+                seed.checkpoints.write(moment, *content, *self._stored(seed), self.replay.added[seed.position])
+            for seed in self.seeds:
+                seed.checkpoints.keep()
+        except OSError as error:
+            step = max(seed.steps for seed in self.seeds)
+            print(f"no checkpoint at step {step}: {one_line(error)}", file=sys.stderr)
+            for seed in self.seeds:
+                with suppress(OSError):
+                    seed.checkpoints.discard()
+
+    def restore(self, checkpoints: Sequence[Checkpoint], obs: Tensor, center: Tensor | None) -> None:
+        """Go back to the moment of `checkpoints`, one of each seed; obs and `center` receive those of that moment.
+
+        ConfigError for a checkpoint that another version of this program has written.
+        """
+        states = [checkpoint.state() for checkpoint in checkpoints]
+        for checkpoint, state in zip(checkpoints, states, strict=True):
+            if state.get("format") != STATE_FORMAT:
+                raise ConfigError(
+                    f"{checkpoint.path} was written by another version of this program, which alone can resume it;"
+                    " overwrite=true starts again and keeps the old run"
+                )
+        for seed, checkpoint, state in zip(self.seeds, checkpoints, states, strict=True):
+            i = seed.position
+            seed.restore(state)
+            obs[i] = state["obs"]
+            if center is not None:
+                center[i] = state["center"]
+            self.agent.load_training_state(i, state["agent"])
+            self.evaluator.set_state(i, state["evaluator"])
+            self.replay.added[i] = state["added"]
+            self.replay.streams.generators[i].set_state(state["sampling"])
+            checkpoint.fill(*self._stored(seed))
+            seed.checkpoints.resume(checkpoint)
+        self.timer.restore(states[-1]["seconds"])
+
+    def _state(self, seed: Seed, obs: Tensor, center: Tensor | None) -> dict[str, Any]:
+        """Everything about a seed but its transitions."""
+        i = seed.position
+        return seed.state() | {
+            "format": STATE_FORMAT,
+            "obs": obs[i].clone(),
+            "center": None if center is None else center[i].clone(),
+            "agent": self.agent.training_state(i),
+            "evaluator": self.evaluator.get_state(i),
+            "added": self.replay.added[i],
+            "sampling": self.replay.streams.generators[i].get_state(),
+            "seconds": self.timer.seconds,
+        }
+
+    def _stored(self, seed: Seed) -> tuple[Callable[[int, int], list[Tensor]], int]:
+        """Where the transitions of a seed are in memory, and the number of the oldest one there."""
+        i = seed.position
+        return partial(self.replay.stretch, i), max(0, self.replay.added[i] - self.replay.capacity)

@@ -1,0 +1,254 @@
+"""Maps as objects: the gauge map's density inside SAC, refused combinations, and a map of one's own."""
+
+import json
+
+import pytest
+import torch
+from helpers import config_of, run_command
+
+from algos import ALGORITHMS, PAPER, Algorithm, paper_settings, saved_config, setting_keys
+from algos.nfwpo import NFWPO
+from algos.sac import SAC
+from algos.td3 import TD3
+from constraints import WeightedPositivePart
+from core.agent import Agent
+from core.config import keys_of, resolve, saved_settings, setting
+from core.maps import Alpha, Gauge, Map, Project, Radial, Sample
+from core.words import ConfigError, split_names
+from envs import TASKS
+
+DIM, OBS = 2, 3
+CONSTRAINT = WeightedPositivePart(lambda obs: 2.0 * obs[..., :DIM] + 3.0, 0.8, DIM)  # its centre is not the origin
+ALL_MAPS = (Project(), Alpha(), Radial(), Gauge())
+
+
+class Soft(Map):
+    """a = c + v / (1 + L(v)), which no one else knows."""
+
+    def __call__(self, constraint, obs, suggested, center):
+        center = constraint.center(obs) if center is None else center
+        offset = suggested - center
+        return center + offset / (1 + constraint.gauge(obs, offset, center)).unsqueeze(-1)
+
+    def with_log_prob(self, constraint, obs, sample, center):
+        center = constraint.center(obs) if center is None else center
+        gauge = constraint.gauge(obs, sample.suggested - center, center)
+        log_prob = sample.log_prob + (constraint.dim + 1) * torch.log1p(gauge)
+        return self(constraint, obs, sample.suggested, center), log_prob
+
+
+class Bare(Map):
+    """A map without a density."""
+
+    def __call__(self, constraint, obs, suggested, center):
+        return constraint.radial_map(obs, suggested, center)
+
+
+# ---------------------------------------------------------------- densities
+
+
+def sac(map, **settings):
+    """An agent of one seed whose actor is N((0.3, -0.5), diag(0.8, 0.5)^2) at every state."""
+    algorithm = Algorithm(SAC, map, "layer")
+    overrides = {"hidden": "[4,4]", "gsde": "false"} | settings
+    config = resolve(algorithm.paper_config("mine", "W+M", "Others", steps=1), overrides)
+    agent = algorithm.build(config, CONSTRAINT, OBS, [0])
+    with torch.no_grad():
+        for parameter in agent.actor.parameters():
+            parameter.zero_()
+        agent.actor.net.layers[-1].bias[0, 0] = torch.tensor([0.3, -0.5, *torch.tensor([0.8, 0.5]).log().tolist()])
+    return agent
+
+
+@pytest.mark.parametrize("map", [Gauge(), Radial(), Soft()], ids=lambda map: type(map).__name__)
+def test_the_density_of_mapped_actions_is_that_of_a_histogram(map):
+    agent = sac(map)
+    obs = torch.tensor([0.1, -0.4, 0.0]).expand(1, 400_000, OBS)
+    with torch.no_grad():
+        noise = torch.randn(1, obs.shape[1], DIM, generator=torch.Generator().manual_seed(0))
+        action, log_prob, _ = agent.sample(obs, agent.centers(obs), noise)
+    assert CONSTRAINT.violation(obs, action).max() <= 1e-6
+    # E[1 / density] over the samples in a region is the region's area, whatever the distribution there.
+    low, high = torch.tensor([-0.5, -0.4]), torch.tensor([0.05, 0.05])
+    inside = ((action > low) & (action < high)).all(-1)
+    assert CONSTRAINT.violation(obs[0, 0], torch.tensor([0.05, 0.05])) < 0  # the box lies in the set
+    area = (inside * (-log_prob.double()).exp()).mean()
+    assert area == pytest.approx(float((high - low).prod()), rel=0.02)
+
+
+@pytest.mark.parametrize("map", [Gauge(), Radial(), Soft()], ids=lambda map: type(map).__name__)
+def test_the_density_of_mapped_actions_follows_the_jacobian(map):
+    agent = sac(map)
+    obs = torch.randn(50, OBS, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    raw = torch.randn(50, DIM, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    suggested = raw.tanh() if map.squashes else raw
+    zero = torch.zeros(50, dtype=torch.float64)
+    sample = Sample(suggested, torch.zeros_like(raw), torch.ones_like(raw), zero)
+    centers = CONSTRAINT.center(obs)
+    mapped, log_prob = agent.map.with_log_prob(CONSTRAINT, obs, sample, centers)
+    torch.testing.assert_close(mapped, agent.map(CONSTRAINT, obs, suggested, centers))
+    for i in range(50):
+        jacobian = torch.autograd.functional.jacobian(
+            lambda u, i=i: agent.map(CONSTRAINT, obs[i], u, centers[i]), suggested[i]
+        )
+        torch.testing.assert_close(log_prob[i], -torch.linalg.slogdet(jacobian)[1], rtol=1e-6, atol=1e-6)
+
+
+def test_sgauge_adds_the_slope_of_the_tanh_and_stays_finite_far_out():
+    agent = sac(Gauge())
+    obs = torch.randn(1, 6, OBS, generator=torch.Generator().manual_seed(3))
+    agent.actor.net.layers[-1].bias.data[..., :DIM] = 60.0  # tanh is 1 in float32
+    action, log_prob, suggested = agent.sample(obs, agent.centers(obs), torch.zeros(1, 6, DIM))
+    assert (suggested == 1).all() and log_prob.isfinite().all() and (log_prob > 50).all()
+    assert CONSTRAINT.violation(obs, action).max() <= 1e-6
+    (gradient,) = torch.autograd.grad(log_prob.sum(), agent.actor.net.layers[-1].bias)
+    assert gradient.isfinite().all()
+    agent.actor.net.layers[-1].bias.data[..., :DIM] = 0.0  # at u = 0 the map gives the centre
+    action, log_prob, _ = agent.sample(obs, agent.centers(obs), torch.zeros(1, 6, DIM))
+    torch.testing.assert_close(action, CONSTRAINT.center(obs))
+    (gradient,) = torch.autograd.grad((action.sum() + log_prob.sum()), agent.actor.net.layers[-1].bias)
+    assert gradient.isfinite().all() and agent.target_entropy == -DIM
+
+
+def test_the_entropy_in_unit_ball_coordinates_is_a_setting_of_the_map():
+    obs, noise = torch.randn(1, 5, OBS), torch.randn(1, 5, DIM)
+    plain, ball = sac(Gauge()), sac(Gauge(), entropy="ball")
+    action, log_prob, suggested = ball.sample(obs, ball.centers(obs), noise)
+    assert plain.map == Gauge() and ball.map == Gauge(entropy="ball")
+    ray = CONSTRAINT.ray(obs, suggested, ball.centers(obs))
+    before, after = (agent.sample(obs, agent.centers(obs), noise) for agent in (plain, ball))
+    difference = ray.gauge_log_prob(torch.zeros(1, 5), True) - ray.gauge_log_prob(torch.zeros(1, 5))
+    torch.testing.assert_close(after[1] - before[1], difference)
+    assert torch.equal(before[0], action)
+
+
+# ---------------------------------------------------------------- which combinations there are
+
+
+@pytest.mark.parametrize(
+    "agent, map, placement, reason",
+    [
+        (SAC, Project(), "layer", "SAC needs the log-density of mapped actions, and Project has no with_log_prob"),
+        (SAC, Project(), "rollout", "SAC is implemented for placement environment and layer, not rollout"),
+        (SAC, Alpha(), "environment", "Alpha can stand in placement layer, not environment"),
+        (SAC, Gauge(), "rollout", "SAC is implemented for placement environment and layer, not rollout"),
+        (SAC, Bare(), "layer", "Bare has no with_log_prob"),
+        (TD3, Alpha(), "rollout", "Alpha can stand in placement layer, not rollout"),
+        (TD3, Gauge(), "environment", "Gauge can stand in placement layer, not environment"),
+        (TD3, Project(), "wrapper", "unknown placement 'wrapper'"),
+        (NFWPO, Project(), "layer", "NFWPO is implemented for placement rollout, not layer"),
+        (NFWPO, Radial(), "rollout", "NFWPO is implemented for Project, not Radial"),
+    ],
+)
+def test_a_combination_that_is_not_implemented_is_refused_with_the_reason(agent, map, placement, reason):
+    with pytest.raises(ValueError) as error:
+        Algorithm(agent, map, placement)
+    assert reason in str(error.value)
+
+
+def test_what_is_accepted_is_what_the_table_has_and_no_more():
+    accepted = set()
+    for agent in (TD3, SAC, NFWPO):
+        for map in ALL_MAPS:
+            for placement in ("environment", "rollout", "layer"):
+                try:
+                    Algorithm(agent, map, placement)
+                except ValueError:
+                    continue
+                accepted.add((agent, type(map), placement))
+    assert accepted == {(row.agent, type(row.map), row.placement) for row in ALGORITHMS.values()}
+
+
+@pytest.mark.parametrize("map", ALL_MAPS, ids=lambda map: type(map).__name__)
+def test_maps_stand_only_where_random_actions_and_suggestions_fit(map):
+    """Beyond "layer": pulling back is the map itself, feasible actions stay, and suggestions are in the box."""
+    obs = torch.randn(200, OBS, generator=torch.Generator().manual_seed(4))
+    action = 2 * torch.rand(200, DIM, generator=torch.Generator().manual_seed(5)) - 1
+    pulled_back = map.pull_back(CONSTRAINT, obs, action, None)
+    torch.testing.assert_close(map.pull_back(CONSTRAINT, obs, pulled_back, None), pulled_back)
+    if map.placements != ("layer",):
+        assert map.squashes and torch.equal(map(CONSTRAINT, obs, action, None), pulled_back)
+
+
+# ---------------------------------------------------------------- a map and an algorithm of one's own
+
+
+@pytest.mark.parametrize("agent", [TD3, SAC])
+def test_a_map_of_ones_own_is_one_class(agent, tmp_path, monkeypatch):
+    monkeypatch.setitem(ALGORITHMS, "Mine", Algorithm(agent, Soft(), "layer"))
+    words = "algo=Mine env=W+M seed=0,1 steps=120 learning_starts=40 batch_size=8 hidden=[8,8] train_freq=1"
+    words += " gradient_steps=1 eval_every=60 eval_episodes=1 final_episodes=1"
+    assert run_command([*words.split(), f"results={tmp_path}"]) == 0
+    results = [json.loads(path.read_text()) for path in tmp_path.glob("*/*/seed=*/result.json")]
+    assert len(results) == 2 and all(result["gradient_steps"] == 79 for result in results)
+    assert all(result["largest_violation"] <= 1e-6 for result in results)
+
+
+def test_centres_are_computed_once_and_replayed(monkeypatch):
+    """No gradient step asks for a centre where the map says that it needs one."""
+    calls = []
+
+    def center(self, obs):
+        calls.append(obs.shape)
+        return original(self, obs)
+
+    original = WeightedPositivePart.center
+    agent = sac(Soft())
+    obs = torch.randn(1, 4, OBS)
+    monkeypatch.setattr(WeightedPositivePart, "center", center)
+    centers = agent.centers(obs)
+    agent.sample(obs, centers, torch.zeros(1, 4, DIM))
+    assert calls == [obs.shape] and agent.stores_centers
+    assert not Algorithm(TD3, Project(), "layer").map.stores_centers(CONSTRAINT)
+    assert not Soft().stores_centers(TASKS["HC+O"].constraint)  # its centre is the origin
+
+
+def test_the_settings_of_a_map_are_keys_of_its_algorithms(monkeypatch):
+    from dataclasses import dataclass
+
+    @dataclass
+    class Scaled(Soft):
+        scale: float = setting(1.0, "what it is multiplied with")
+
+    monkeypatch.setitem(ALGORITHMS, "Mine", Algorithm(TD3, Scaled(), "layer"))
+    config = config_of(["algo=Mine", "env=R+M", "scale=0.5"])
+    assert (config.scale, config_of("algo=Mine env=R+M").scale) == (0.5, 1.0) and "scale" in setting_keys()
+    assert ALGORITHMS["Mine"].build(config, CONSTRAINT, OBS, [0]).map == Scaled(0.5)
+    # A setting that only densities use is none of TD3's.
+    assert "entropy" not in keys_of(ALGORITHMS["DAlpha"].config_class)
+    assert {"entropy", "boundary_weight"} <= keys_of(ALGORITHMS["SAlpha"].config_class).keys()
+
+
+def test_an_algorithm_of_ones_own_may_have_one_row_of_settings():
+    class Constant(TD3):
+        family = "Constant"
+        paper = {"Others": {"gamma": 0.5}}
+
+    row = Algorithm(Constant, Project(), "layer")
+    assert row.paper_config("Mine", "R+N", "Reacher", steps=7).gamma == 0.5
+    assert issubclass(Constant, Agent)
+
+
+# ---------------------------------------------------------------- settings
+
+
+def test_names_of_the_paper_and_all():
+    groups = {"paper": PAPER}
+    assert split_names("algorithm", "paper", ALGORITHMS, groups) == list(PAPER)
+    assert split_names("algorithm", "all", ALGORITHMS, groups) == list(ALGORITHMS)
+    assert split_names("algorithm", "DGauge,paper,DPre", ALGORITHMS, groups) == ["DGauge", *PAPER]
+    with pytest.raises(ConfigError, match="did you mean paper"):
+        split_names("algorithm", "papr", ALGORITHMS, groups)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_saved_settings_come_back(name):
+    task = TASKS["R+M"]
+    base = paper_settings(name, "R+M", task.robot, task.steps)
+    config = resolve(base, {"seed": "3,5-7", "train_freq": "20", "hidden": "[8,4]"})
+    saved = saved_settings(config, 5)
+    assert saved["seed"] == "5" and saved["train_freq"] == "20" and "results" not in saved
+    config.seeds = (5,)
+    assert saved_config(saved) == config
+    # Older run folders have keys without a value, of settings that the algorithm does not have.
+    assert saved_config({"fw_learning_rate": None, "gsde": None, "penalty": None} | saved) == config

@@ -193,11 +193,11 @@ def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
         override(config, schema, key, text)
     resolved = typing.cast(Config, OmegaConf.to_object(config))
     resolved.seeds = tuple(resolved.seeds)  # OmegaConf makes a list of it
-    check_ranges(resolved)
+    _check_ranges(resolved)
     return resolved
 
 
-def check_ranges(config: Config) -> None:
+def _check_ranges(config: Config) -> None:
     """ConfigError for a number that is not finite or a value that breaks the rule of its field."""
     for key, f in keys_of(config).items():
         value, rule = getattr(config, f.name), f.metadata.get("rule")

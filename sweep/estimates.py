@@ -83,7 +83,7 @@ def seconds(config: Config, seeds: int, start: int = 0) -> float:
 def memory(config: Config, seeds: int) -> float:
     """Bytes, with the replay buffer as full as it gets."""
     robot = _robot(config)
-    centers = 2 if ALGORITHMS[config.algo].map.stores_centers(TASKS[config.env].constraint) else 0
+    centers = 2 if ALGORITHMS[config.algo].map.replays_center(TASKS[config.env].constraint) else 0
     width = 2 * robot.obs_dim + (1 + centers) * robot.action_dim + 2
     return PROCESS_BYTES + seeds * (SEED_BYTES + 4.0 * width * min(config.buffer_size, config.steps))
 

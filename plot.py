@@ -1,6 +1,6 @@
 """Tables and figures of the benchmark.
 
-    python plot.py results/          everything that a folder of results holds, finished or not:
+    python plot.py results/          all runs of a folder of results, finished or not:
                                        tables/rewards       mean and standard error of the finished runs
                                        tables/comparison    the same beside the paper's table
                                        tables/aggregate     interquartile mean over tasks, with intervals
@@ -42,7 +42,7 @@ RUNTIME = "bench/results/runtime.csv"
 
 
 def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
-    """Everything that a folder of results holds."""
+    """Plot all runs of a folder of results. Returns the files written."""
     root = _path(words, "folder of results")
     formats = _formats(options, (*tables.FORMATS, *style.FORMATS))
     groups = _read(root, options)
@@ -51,7 +51,7 @@ def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
     left_out = list_left_out(groups)
     note = "Not in the tables:\n" + "".join(f"- {line}\n" for line in left_out) if left_out else ""
     written = []
-    # On a screen the last lines are those in view, so the main table comes last.
+    # A screen shows the last lines, so the main table comes last.
     for table in (
         improvement_table(aggregates),
         mean_table(aggregates),
@@ -68,7 +68,7 @@ def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
 
 
 def _read(root: Path, options: dict[str, str]) -> Groups:
-    """The runs in `root` that the options ask for; what cannot be used is named on stderr."""
+    """The runs in `root` that the options ask for. Names the unusable ones on stderr."""
     if not root.is_dir():
         raise ConfigError(f"{root} is not a folder")
     found = find_runs(root)
@@ -76,7 +76,7 @@ def _read(root: Path, options: dict[str, str]) -> Groups:
         raise ConfigError(f"no runs in {root} (looked for <task>/<algorithm>/seed=<n> in it)")
     tasks_there = {folder.parent.parent.name for folder in found}
     algos_there = {parse_variant(folder.parent.name)[0] for folder in found}
-    # The choices are what there is, so that a new task or algorithm needs no entry here.
+    # The folder gives the choices, so that a new task or algorithm needs no entry here.
     tasks = split_names(f"env in {root}", options.get("env", "all"), order_tasks(tasks_there))
     algos = order_algos(algos_there)
     of_paper = {"paper": [algo for algo in algos if algo in COLORS]}
@@ -90,7 +90,7 @@ def _read(root: Path, options: dict[str, str]) -> Groups:
     return groups
 
 
-# The other commands import what they need themselves: PyTorch and the simulators take seconds to load.
+# The other commands import late, because PyTorch and the simulators take seconds to load.
 
 
 def plot_tables(words: Sequence[str], options: dict[str, str]) -> list[Path]:
@@ -157,7 +157,7 @@ COMMANDS = {"tables": plot_tables, "maps": plot_maps, "actions": plot_actions, "
 
 
 def run(arguments: Sequence[str]) -> list[Path]:
-    """Do what the command line says; returns the files written."""
+    """Carry out the command line. Returns the files written."""
     words, options = parse_arguments(arguments)
     if not words or words[0] not in COMMANDS:
         return plot_results(words, options)

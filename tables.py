@@ -1,4 +1,4 @@
-"""Tables, whatever is in them: plain text for a terminal, Markdown, LaTeX and CSV."""
+"""Tables of any content: plain text for a terminal, Markdown, LaTeX and CSV."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ MISSING = "–"
 
 class TableCell(NamedTuple):
     lines: tuple[str, ...]
-    """The first is the value; the others belong below it or, on one line, after it."""
+    """The first is the value. The others stand below it or, on one line, after it."""
     bold: bool = False
     missing: bool = False
     merge: bool = False
     """LaTeX draws equal neighbours of this kind as one."""
     tex: str | None = None
-    """LaTeX for the first line, where it is more than the text."""
+    """LaTeX of the first line, if it differs from the text."""
 
 
 @dataclass
@@ -33,13 +33,13 @@ class Table:
     title: str
     header: list[str]
     labels: int
-    """How many of the leading columns name the row; they are set flush left."""
+    """How many leading columns name the row. They are aligned left."""
     sections: list[list[list[TableCell]]]
     """Rows of cells; a rule separates the sections."""
     records: list[dict[str, Any]]
-    """The same content in full, one record a cell or row, for CSV."""
+    """The same content in full precision for CSV: one record for each cell or row."""
     spans: dict[str, int] = field(default_factory=dict)
-    """LaTeX headings above so many of the columns each, from the first after the labels on."""
+    """LaTeX headings above several columns each, with their number, from the first column after the labels."""
 
 
 def text_cells(*texts: str) -> list[TableCell]:
@@ -47,7 +47,7 @@ def text_cells(*texts: str) -> list[TableCell]:
 
 
 def to_terminal(table: Table, bold: bool, width: int | None) -> str:
-    """Plain text without the empty columns; those beyond `width` characters (None: no limit) go below."""
+    """Plain text without empty columns. Columns beyond `width` characters (None: no limit) form a block below."""
     rows = [row for section in table.sections for row in section]
     widths = [
         max([len(head), *(len(line) for row in rows for line in row[j].lines)]) for j, head in enumerate(table.header)
@@ -94,7 +94,7 @@ def to_markdown(table: Table) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A document of one table that compiles as it stands; with package `standalone`, \\input takes it too."""
+    """A LaTeX document of one table. With the package `standalone`, \\input takes it too."""
     alignment = "l" * table.labels + "r" * (len(table.header) - table.labels)
     body = [rf"\begin{{tabular}}{{{alignment}}}", r"\toprule"]
     heads = list(table.header)
@@ -123,7 +123,7 @@ def to_latex(table: Table) -> str:
 
 
 def _latex_row(row: Sequence[TableCell]) -> list[str]:
-    # Equal neighbours that merge are one cell; any other is a group of its own.
+    # Equal neighbours that merge form one group; every other cell is its own group.
     merged = [list(group) for _, group in groupby(enumerate(row), lambda item: item[1] if item[1].merge else item[0])]
     lines = []
     for i in range(max(1 if cell.merge else len(cell.lines) for cell in row)):
@@ -165,7 +165,7 @@ def print_table(table: Table) -> None:
 
 
 def write_table(table: Table, folder: Path, formats: Sequence[str], note: str = "") -> list[Path]:
-    """Write `table` to `folder` in those of `formats` that are a table's, with `note` below it in Markdown."""
+    """Write `table` to `folder` in the `formats` of tables, with `note` below the Markdown. Returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for suffix in formats:

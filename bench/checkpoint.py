@@ -1,12 +1,12 @@
-"""What a checkpoint costs with a full replay buffer.
+"""The cost of a checkpoint with a full replay buffer.
 
     python bench/checkpoint.py                                               # HC+O, a million transitions
     python bench/checkpoint.py seeds=4 env=R+L2 transitions=2e5 folder=DIR   # DIR: on the disk to be measured
 
-For each number of seeds in lockstep, with as many transitions a seed (synthetic: only their size matters): time and
-bytes of a checkpoint after `checkpoint_every` steps, of one that has to write the whole buffer, and of resuming; the
-memory that writing needs beside the training's; and the share of the training's time, from the time of a gradient
-step measured here.
+`transitions` is the number of each seed; they are synthetic, because only their size matters. Prints for each number of
+seeds in lockstep: time and bytes of a checkpoint after `checkpoint_every` steps, and of one that writes the whole
+buffer; the time of resuming; the memory that writing needs in addition; and the checkpoint's share of the training's
+time, by a gradient step that is timed here.
 """
 
 from __future__ import annotations

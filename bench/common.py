@@ -33,14 +33,14 @@ def make_config(algo: str, **settings: object) -> Config:
 
 
 def make_agent(name: str, batch: int, seeds: Sequence[int], device: torch.device | str = "cpu") -> Agent:
-    """A new agent with the paper's settings for the task, the batch size apart."""
+    """A new agent with the paper's settings for the task and another batch size."""
     config = make_config(name, batch_size=batch, device=device)
     obs_dim = envs.make(TASK).observation_space.shape[0]
     return ALGORITHMS[name].build(config, envs.constraint(TASK), obs_dim, seeds)
 
 
 def fill_replay(agent: Agent, transitions: int) -> Replay:
-    """A buffer with as many steps of the environment of each of the agent's seeds, under its warm-up actions."""
+    """A replay buffer with `transitions` steps of each of the agent's seeds, under its warm-up actions."""
     seeds = agent.seeds
     everyone = range(len(seeds))
     replay = Replay(seeds, transitions, agent.obs_dim, agent.action_dim, agent.stores_centers, agent.device)

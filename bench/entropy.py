@@ -47,7 +47,7 @@ MAPS = {
 
 
 def visited_states(task: str, states: int) -> Tensor:
-    """Observations (states, n), twenty steps of uniform actions, projected, apart."""
+    """Observations (states, n), twenty steps apart, under uniform actions that are projected."""
     env = envs.make(task, project=True)
     env.action_space.seed(0)
     obs, _ = env.reset(seed=0)
@@ -142,7 +142,7 @@ def main(arguments: list[str]) -> int:
                 lines.append(f"| {' | '.join(measure(task, states))} |")
                 path.write_text("\n".join(lines) + "\n")
         except KeyboardInterrupt:
-            print("\ninterrupted; what is measured stays", file=sys.stderr)
+            print("\ninterrupted; the measurements so far are kept", file=sys.stderr)
         print("\n".join(lines))
     except (ConfigError, OSError) as error:
         print(f"bench/entropy.py: {error}", file=sys.stderr)

@@ -1,9 +1,9 @@
 """The arithmetic floor of a gradient step: its matrix products and nothing else.
 
 `update_products` lists the products that the mathematics of one update needs, from the widths of the layers; `Floor`
-carries them out, each into memory that is already there. What is not needed is not listed: in the critics' step no
+carries them out, each into memory that exists already. It lists only the necessary ones: in the critics' step no
 gradient of their input; in the actor's step no gradient of the critics' weights, of the state, or of the actor's input.
-Whatever is no matrix product costs nothing here: biases, activations, losses, noise, sampling, optimiser, targets.
+Everything else costs nothing here: biases, activations, losses, noise, sampling, optimiser, targets.
 
 Names of matrices: `x0` is what a network is given, `x1` what its first layer returns, `g1` the gradient of that;
 `w0` and `dw0` are the weights of its first layer and their gradient.
@@ -105,7 +105,7 @@ class Update:
 
     @property
     def flops(self) -> float:
-        """Of one update, on average."""
+        """Multiplications and additions of one update, on average."""
         return sum(p.flops for p in self.always) + sum(p.flops for p in self.delayed) / self.delay
 
 

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's TD3 and SAC at the task that ours train on, for comparison (`pip install .[bench]`)."""
+"""Stable-Baselines3's TD3 and SAC on the task of our benchmark, for comparison (`pip install .[bench]`)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ def peer_version() -> str:
 
 
 class Peer:
-    """A model with the batch size, layers and hyperparameters of `config`, its replay buffer full with `transitions`
-    steps under random actions. It trains as our DPre and SPre do: on the environment that projects."""
+    """A model with the hyperparameters of `config`, and `transitions` steps under random actions in its replay buffer.
+
+    Like our DPre and SPre, it trains on the environment that projects."""
 
     def __init__(self, base: str, config: Config, transitions: int):
         import stable_baselines3

@@ -1,10 +1,9 @@
 """Where the time of a training run goes, by phase.
 
 The run is made by `sweep.train.make_trainer`, with the paper's settings on HC+O, and is 10,000 steps long. Gradient
-steps begin after 9,500 of them; TD3 takes them every 100 steps instead of once an episode of 1,000, one for each step
-all the same.
-It has two evaluations, a final one that is no longer than these, and two checkpoints, of all its 10,000 transitions and
-at its end.
+steps begin after 9,500 of them. TD3 takes them every 100 steps instead of once an episode of 1,000, but still one for
+each step. The run has two evaluations, a final one of the same length, and two checkpoints: of all 10,000 transitions,
+and at the end.
 
 Each phase's time is scaled to the protocol's million steps: gradient steps and exploration to the 9e5 steps after its
 own warm-up; evaluations to its number of episodes, without the first evaluation here, which makes the environments;
@@ -51,11 +50,6 @@ class Phases:
 
     def share(self, phase: str) -> float:
         return self.scaled[phase] / sum(self.scaled.values())
-
-    @property
-    def share_outside(self) -> float:
-        """Of everything but sampling and gradient steps."""
-        return sum(map(self.share, OUTSIDE))
 
 
 class Stopwatch:

@@ -6,9 +6,9 @@
     python bench/runtime.py algo=DRad,SRad,DOpt,NFW device=cuda    # networks and replay buffer on a GPU
 
 A trial fills replay buffers with 1,000 steps of the environment under random feasible actions, makes new agents with
-the paper's hyperparameters but for the batch size, and has them take `steps` gradient steps, sampling included. Of one
-batch size, the algorithms take turns of 50 steps, so that a machine that is slow for a while is so for all. Every trial
-has seeds of its own, and every batch size is saved when it is measured, so that what an interruption leaves is of use.
+the paper's hyperparameters but for the batch size, and has them take `steps` gradient steps, sampling included. At
+one batch size, the algorithms take turns of 50 steps, so that a slow moment of the machine affects all of them. Every
+trial has its own seeds. Every batch size is saved when it is measured, so that an interruption loses little.
 
 Prints a table and saves `out`/runtime.csv (default bench/results), a row a measurement, which `python plot.py runtime`
 draws. CPU seconds are CPU time of the process, on one thread, so that other load on the machine does not count. With a
@@ -59,7 +59,7 @@ DEFAULTS = {
 
 
 def measure(agents: Mapping[str, GradientSteps], steps: int, progress: Callable[[], None]) -> dict[str, tuple]:
-    """CPU and GPU seconds of the first `steps` gradient steps of each, in turns, after each of which is `progress`."""
+    """CPU and GPU seconds of the first `steps` gradient steps of each agent. They take turns; `progress` ends each."""
 
     def train(take_gradient_step: GradientSteps, count: int) -> None:
         for _ in range(count):
@@ -84,7 +84,7 @@ def measure(agents: Mapping[str, GradientSteps], steps: int, progress: Callable[
 
 
 def kernel_seconds(call: Callable[[], None]) -> float:
-    """Of the kernels that `call`, which waits for the GPU, makes it run."""
+    """GPU seconds of the kernels that `call` launches; `call` waits for them."""
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         call()
     # Events of the host may repeat the time of the kernels that they launch.
@@ -93,7 +93,7 @@ def kernel_seconds(call: Callable[[], None]) -> float:
 
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], list[int], dict[str, int], str, Path]:
-    """Algorithms, batch sizes, whole numbers by name, device and folder. Raises ConfigError for what is wrong."""
+    """Algorithms, batch sizes, whole numbers by name, device and folder. Raises ConfigError for a wrong word."""
     options = DEFAULTS | parse_words(arguments, DEFAULTS)
     check_device(options["device"])
     batches = whole_numbers("batch", options["batch"])
@@ -145,7 +145,7 @@ def main(arguments: list[str]) -> int:
             run_trials(names, batches, counts, device, path)
         except KeyboardInterrupt:
             interrupted = True
-            print("\ninterrupted; what is measured stays", file=sys.stderr)
+            print("\ninterrupted; the measurements so far are kept", file=sys.stderr)
         print(to_terminal(runtime_table(path), bold=False, width=None))
     except (ConfigError, OSError) as error:
         print(f"bench/runtime.py: {error}", file=sys.stderr)

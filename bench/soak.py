@@ -1,16 +1,16 @@
-"""Does an infeasible action ever reach a robot? Every task, every map, suggestions as bad as they come.
+"""Does an infeasible action ever reach a robot? Every task, every map, the worst suggestions.
 
     python bench/soak.py                                   # a million steps of the simulators, ten million checks
     python bench/soak.py env=W+M,R+T steps=1e4 checks=1e5 seed=1
 
 Suggestions come from random networks with exploding weights, from a list of extreme numbers (up to 3e38, denormal,
 -0.0, infinite, NaN) and from the boundary of the set. In the simulators each is mapped and executed in float32, as in
-training, and the environment checks it in float64. The checks without simulator take observations no robot reaches:
-velocities of zero, denormal and up to 1e30, angles up to 7. (A map sees them in float32. Of an angle of 1e5 that leaves
-too little for its sine, which the check in float64 would notice.) Suggestions that are not finite must be refused,
-clearly; everything else must be executed with a violation of at most 1e-6.
+training, and the environment checks it in float64. The checks without simulator take observations that no robot
+reaches: velocities of zero, denormal and up to 1e30, angles up to 7. (A map sees them in float32, which is too coarse
+for the sine of an angle of 1e5, and the check in float64 would notice.) A suggestion that is not finite must be refused
+with a clear message; every other one must be executed with a violation of at most 1e-6.
 
-Prints the largest violation of each task and map. Exit code 1, and how to reproduce it, where it is too large.
+Prints the largest violation of each task and map, and how to reproduce one that is too large. The exit code is then 1.
 """
 
 from __future__ import annotations
@@ -153,8 +153,9 @@ class Soak:
 
 
 def soak(tasks: list[str], steps: int, checks: int, seed: int, parallel: int = 50, progress: bool = True) -> list[Soak]:
-    """`steps` simulated and `checks` unsimulated actions, shared out among the tasks and maps; of each task, `parallel`
-    environments are stepped together, each with a network of its own."""
+    """Check `steps` simulated and `checks` unsimulated actions, shared among the tasks and maps.
+
+    `parallel` environments of a task step together, each with its own network."""
     share = len(tasks) * len(MAPS)
     soaks = []
     torch.set_flush_denormal(True)  # as run.py does

@@ -1,4 +1,4 @@
-"""What training costs: milliseconds of a gradient step and of an environment step, beside the arithmetic floor.
+"""The cost of training: milliseconds of a gradient step and of an environment step, beside the arithmetic floor.
 
     python bench/training.py                                        # TD3 and SAC, 1 to 10 seeds, 1 and 2 threads
     python bench/training.py base=TD3 seeds=1,10 threads=1 rounds=5 steps=10 out=bench/results
@@ -7,19 +7,19 @@ TD3 is DPre (batch 100, layers of 400 and 300), SAC is SPre (batch 256, layers o
 (HC+O) with the paper's settings. Beside each number of seeds in lockstep stand
 
 - the floor: the matrix products of one update in the same shapes and nothing else (bench/floor.py);
-- where it is installed, Stable-Baselines3's algorithm of the same name, of one seed, with the same batch, layers and
-  rate, on the same environment, which projects (bench/peer.py; `pip install .[bench]`).
+- if it is installed, Stable-Baselines3's algorithm of the same name with one seed and the same batch, layers and rate,
+  on the same environment, which projects (bench/peer.py; `pip install .[bench]`).
 
 All take turns of `steps` gradient steps, then of ten times as many environment steps, replay sampling included, with
-10,000 transitions a seed in the buffer. A round is a turn of each; the next one goes the other way round. Ratios are
-the median of those within each round, so that whatever else the machine does hits both sides of a ratio alike; times
-are the least and the median over rounds. With one thread they are CPU time of the process, with more wall-clock time.
+10,000 transitions a seed in the buffer. A round is a turn of each, and every other round has the reverse order. A ratio
+is the median of the ratios within rounds, so that other load on the machine affects both sides alike. Times are the
+least and the median over rounds: CPU time of the process with one thread, wall-clock time with more.
 
 Environment steps are those of the training loop that run.py runs (exploration, projection, simulator, replay buffer),
 and of Stable-Baselines3's `collect_rollouts`.
 
-At the first number of threads follows, for each number of seeds, where the wall-clock time of a whole run goes
-(bench/phases.py says how that is measured and scaled to the paper's million steps).
+For the first number of threads and each number of seeds, a second table divides the wall-clock time of a whole run
+into phases (bench/phases.py explains how they are measured and scaled to the paper's million steps).
 
 Prints the tables and saves them in `out` (default bench/results) as training and phases, .md and .csv.
 """
@@ -121,7 +121,7 @@ def environment_turn(base: str, seeds: int, steps: int) -> Turn:
 
 
 def turns(base: str, seeds: int, steps: int, peer: Peer | None) -> dict[str, Turn]:
-    """What takes turns, by name; "update" and "environment" are ours."""
+    """The turns, by name; "update" and "environment" are ours."""
     config = make_config(ALGO[base])
     agent = make_agent(ALGO[base], config.batch_size, range(seeds))
     replay = fill_replay(agent, TRANSITIONS)
@@ -159,7 +159,7 @@ def measure(base: str, threads: int, options: Options, cells: dict[int, dict[str
 
 
 def summary(milliseconds: dict[str, list[float]]) -> dict[str, Any]:
-    """Least and median time of each, and medians of the ratios within rounds; "" for what was not measured."""
+    """Least and median time of each, and medians of the ratios within rounds; "" if it was not measured."""
 
     def ratio(above: str, below: str) -> float | str:
         pairs = list(zip(milliseconds.get(above, []), milliseconds.get(below, []), strict=False))
@@ -262,7 +262,7 @@ def save(table: Table, folder: Path) -> None:
 
 
 def parse_arguments(arguments: Sequence[str]) -> Options:
-    """Raises ConfigError for what is wrong."""
+    """The options of the command. Raises ConfigError for a wrong word."""
     options = DEFAULTS | parse_words(arguments, DEFAULTS)
     steps = whole_number("steps", options["steps"])
     if steps % 2:
@@ -278,7 +278,7 @@ def parse_arguments(arguments: Sequence[str]) -> Options:
 
 
 def measure_all(options: Options) -> None:
-    """Measure and print everything; what is measured is saved after each number of threads, and of seeds."""
+    """Measure and print everything. Saves after each number of threads, and of seeds."""
     records: list[dict] = []
     phases: list[dict] = []
     total = len(options.bases) * len(options.threads) * len(options.seeds) * (options.rounds + 1)
@@ -315,7 +315,7 @@ def main(arguments: list[str]) -> int:
         print(f"bench/training.py: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("\ninterrupted; what is measured is in the folder", file=sys.stderr)
+        print("\ninterrupted; the measurements so far are in the folder", file=sys.stderr)
         return 130
     return 0
 

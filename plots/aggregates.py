@@ -59,7 +59,7 @@ def aggregate(groups: Groups) -> list[Aggregates]:
 
 
 def mean_table(aggregates: Sequence[Aggregates]) -> Table:
-    """Interquartile means; each section has algorithms with scores on the same tasks."""
+    """Interquartile means. Each section has the algorithms with scores on the same tasks."""
     sections, records = [], []
     for aggregate in aggregates:
         for tasks, algos in comparable(aggregate.scores).items():
@@ -78,7 +78,7 @@ def mean_table(aggregates: Sequence[Aggregates]) -> Table:
 
 
 def improvement_table(aggregates: Sequence[Aggregates]) -> Table:
-    """Rows over columns, of each combination of settings with two algorithms to compare."""
+    """The probability that the row's algorithm beats the column's, for each combination of settings."""
     aggregates = [aggregate for aggregate in aggregates if aggregate.improvements]
     algos = order_algos({algo for aggregate in aggregates for algo in aggregate.scores})
     sections, records = [], []

@@ -31,10 +31,10 @@ MANY = 8
 def mean_curve(curves: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Steps, mean and standard error (NaN with one seed), each (n,), of seeds' curves (steps, values).
 
-    The mean is over the seeds that have a value at the step, for those in progress lag behind.
+    The mean at a step is over the seeds that have reached it.
     """
     steps = np.unique(np.concatenate([at for at, _ in curves]))
-    # Masked where a seed has no value (yet); one of NaN stays NaN and breaks the line.
+    # A missing value is masked. A NaN stays NaN and breaks the line.
     values = np.ma.array(np.zeros((len(curves), len(steps))), mask=True)
     for row, (at, value) in zip(values, curves, strict=True):
         row[np.searchsorted(steps, at)] = value
@@ -54,7 +54,7 @@ def draw_curves(groups: Groups, folder: Path, formats: Sequence[str]) -> list[Pa
     for task in dict.fromkeys(condition.task for condition in conditions):
         of_task = {condition.settings: groups[condition] for condition in conditions if condition.task == task}
         jobs.append(partial(_draw_training, task, of_task))
-    # A figure takes up to a second: many are worth the start of a process for each processor.
+    # A figure takes up to a second, so many figures are worth the start of several processes.
     if len(jobs) < MANY:
         return [path for job in jobs for path in job(folder, formats)]
     with ProcessPoolExecutor(max_workers=min(os.cpu_count() or 1, len(jobs))) as pool:
@@ -81,7 +81,7 @@ def _draw_condition(
 def _draw_training(
     task: str, by_settings: dict[str, dict[str, list[Run]]], folder: Path, formats: Sequence[str]
 ) -> list[Path]:
-    """Returns and training measures side by side, of all runs with such: a line style for each of the settings."""
+    """Returns and training measures side by side, of the runs that have measures; a line style for each setting."""
     words = {settings: dict.fromkeys(filter(None, settings.split(", "))) for settings in by_settings}
     common = [word for word in next(iter(words.values())) if all(word in others for others in words.values())]
     curves = [

@@ -34,7 +34,7 @@ Groups = dict[Condition, dict[str, list[Run]]]
 
 @dataclass
 class _Group:
-    """Runs of one configuration; `settings` is what tells it from the others in its label."""
+    """Runs of one configuration; `settings` are those that its label names."""
 
     task: str
     algo: str
@@ -44,15 +44,15 @@ class _Group:
 
 
 def group_runs(runs: Iterable[Run]) -> tuple[Groups, list[str]]:
-    """Group the runs that differ in nothing but the seed; also a line for each that repeats another's seed.
+    """Group the runs that differ only in the seed, and list those that repeat another run's seed.
 
-    Usually a run's folder name tells what is special about it. Where configurations of one label differ all the
-    same (defaults that changed between the runs, say), their labels name the settings that do.
+    Usually a run's folder name has all settings that differ from the paper's. If configurations of one label differ in
+    others (because a default changed between the runs, say), their labels name those too.
     """
     groups: dict[tuple, _Group] = {}
     repeated = []
     for run in runs:
-        # A setting that an algorithm does not have is None, or missing in a run older than the setting.
+        # A setting that the algorithm does not have is None, or missing in a run that is older than the setting.
         settings = run.config.items()
         config = {key: _text(value) for key, value in settings if key not in RUN_KEYS and value is not None}
         key = run.task, run.algo, tuple(sorted(config.items()))
@@ -113,7 +113,7 @@ def statistic(values: Sequence[float]) -> Statistic:
 
 
 def reward_statistics(groups: Groups) -> dict[Condition, dict[str, Statistic]]:
-    """Statistics over the finite results of each cell; cells and rows without any are left out."""
+    """Statistics over the finite results of each cell, without empty cells and rows."""
     statistics: dict[Condition, dict[str, Statistic]] = {}
     for condition, by_algo in groups.items():
         for algo, runs in by_algo.items():

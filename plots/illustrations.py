@@ -24,7 +24,7 @@ from plots.style import plain, save
 from store.folder import Run, find_runs, read_run
 
 SET_COLOR, POINT_COLORS = "#cfe0f3", ("#b8520a", "#1e6b26")
-# Both are nearest to the same corner, so the projection cannot tell them apart and its gradient is zero.
+# Both are nearest to the same corner: the projection maps them to one point, with a gradient of zero.
 SAMPLES = ((1.16, 0.30), (1.20, -0.13))
 PANELS = 8
 """Moments of an episode at which the feasible set is drawn."""
@@ -118,7 +118,7 @@ def play(run: Run) -> Episode:
     policy = agent.policy([0])
     steps, done = [], False
     env.reset(seed=stream_seed(run.seed, "evaluation"))
-    obs, _ = env.reset()  # seeding takes a reset of its own, as for the evaluator
+    obs, _ = env.reset()  # the evaluator also seeds with a separate reset
     while not done:
         action = policy(torch.as_tensor(obs, dtype=torch.float32)[None, None])[0, 0].numpy()
         next_obs, reward, terminated, truncated, _ = env.step(action)
@@ -131,7 +131,7 @@ def play(run: Run) -> Episode:
 def draw_actions(folder: Path, out: Path, formats: Sequence[str]) -> list[Path]:
     """Feasible set and executed action at moments of an episode, and how far out the actions are throughout.
 
-    `folder` is a run's. Raises ConfigError if it is none, or if its task has not two dimensions.
+    Raises ConfigError if `folder` is not a run's, or if its task does not have two dimensions.
     """
     if folder not in find_runs(folder.parent.parent.parent):
         raise ConfigError(f"{folder} is not the folder of a run (<results>/<task>/<algorithm>/seed=<n>)")

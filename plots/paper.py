@@ -1,4 +1,4 @@
-"""What the paper fixes: its algorithms in order, their colours here, and its table of rewards."""
+"""The paper's algorithms in order, their colours here, and its table of rewards."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-# A version with penalty is the darker shade of the one without; the TD3 family is drawn solid, the SAC family dashed.
+# A version with penalty has a darker shade. The TD3 family is drawn solid, the SAC family dashed.
 COLORS = {
     "DPro": "#7fb2e5",
     "DPro+": "#1f4fa8",
@@ -51,7 +51,7 @@ def read_paper() -> dict[tuple[str, str, str], Statistic]:
 
 
 def order_tasks(names: Iterable[str]) -> list[str]:
-    """In the paper's order, tasks that it does not have after its own."""
+    """The tasks in the paper's order, other tasks last."""
     return _order(names, dict.fromkeys(task for task, _, _ in read_paper()))
 
 

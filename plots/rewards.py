@@ -28,12 +28,12 @@ def best_three(means: dict[str, float]) -> set[str]:
 
 
 def decimals(values: Iterable[float]) -> int:
-    """As in the paper: two for Reacher's returns of some tens, none for those of hundreds and thousands."""
+    """As in the paper: two for Reacher's returns of some tens, none for returns of hundreds and thousands."""
     return 2 if max(abs(value) for value in values) < 100 else 0
 
 
 def reward_table(groups: Groups) -> Table:
-    """Conditions by algorithms, as the paper's: mean, standard error, best three bold, seeds where not ten."""
+    """The paper's table: mean and standard error, the best three bold, the number of seeds unless it is ten."""
     statistics = reward_statistics(groups)
     algos = order_algos({*COLORS, *(algo for row in statistics.values() for algo in row)})
     sections, records = [], []
@@ -70,9 +70,9 @@ def _lines(stat: Statistic, digits: int) -> tuple[str, ...]:
 
 
 def comparison_table(groups: Groups) -> Table:
-    """Ours beside the paper's, for the cells that the paper has.
+    """Our results beside the paper's, for the cells that the paper has.
 
-    Of the settings only the batch size chooses the paper's row; runs with others are compared too, as labelled.
+    Only the batch size chooses the paper's row. Runs with other settings are compared too; the label has those.
     """
     statistics, paper = reward_statistics(groups), read_paper()
     sections, records = [], []

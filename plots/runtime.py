@@ -1,4 +1,4 @@
-"""The paper's runtime experiment from what `bench/runtime.py` saved: a table, and the bars of its figure."""
+"""The paper's runtime experiment, from the file of `bench/runtime.py`: a table and the bars of the figure."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Seconds = dict[tuple[str, int], list[tuple[float, float]]]
 
 
 def read_runtime(path: Path) -> list[dict]:
-    """The rows of the file, numbers as such. Raises ConfigError for another kind of file, or an empty one."""
+    """The rows of the file, with numbers parsed. Raises ConfigError for another kind of file and for an empty one."""
     if not path.is_file():
         raise ConfigError(f"{path} is not a file (bench/runtime.py makes it)")
     with open(path, newline="", encoding="utf-8") as file:
@@ -84,7 +84,7 @@ def _text(stat: Statistic) -> str:
 
 
 def draw_runtime(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
-    """Bars of each algorithm for the paper's batch sizes (for those measured, if none of them is)."""
+    """Bars of each algorithm for the paper's batch sizes, or for all measured sizes if none of those is measured."""
     records = read_runtime(path)
     seconds = _by_cell(records)
     measured = sorted({batch for _, batch in seconds})

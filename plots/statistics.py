@@ -47,7 +47,7 @@ def reference(task: str) -> float | None:
 
 
 def normalised_scores(groups: Groups) -> dict[str, Scores]:
-    """Scores by settings. Where algorithms coincide, on R+N, one without runs of its own has the other's."""
+    """Scores by settings. On R+N some algorithms coincide: one without runs takes the other's scores."""
     by_settings: dict[str, Scores] = defaultdict(lambda: defaultdict(dict))
     for condition, by_algo in groups.items():
         if (unit := reference(condition.task)) is None:
@@ -70,7 +70,7 @@ def normalised_scores(groups: Groups) -> dict[str, Scores]:
 
 
 def comparable(scores: Scores) -> dict[tuple[str, ...], list[str]]:
-    """Algorithms by the tasks that they have scores on: aggregates compare over the same tasks only."""
+    """Algorithms by the tasks that they have scores on, because aggregates compare over the same tasks only."""
     by_tasks: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for algo, by_task in scores.items():
         by_tasks[tuple(by_task)].append(algo)
@@ -107,14 +107,14 @@ def probability_of_improvement(first: dict[str, np.ndarray], second: dict[str, n
 
 
 def _chance_above(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """P(x > y) + P(x = y) / 2 of samples (..., n) and (..., m), without the p-values that SciPy's ranks come with."""
+    """P(x > y) + P(x = y) / 2 of samples (..., n) and (..., m), without the p-values that SciPy would compute too."""
     x, y = x[..., :, None], y[..., None, :]
     return ((x > y).mean((-2, -1)) + (x >= y).mean((-2, -1))) / 2
 
 
 def _estimate(statistic: Callable[..., np.ndarray], samples: Sequence[np.ndarray]) -> Estimate:
-    """`statistic` of `samples` (..., n_k), each resampled on its own."""
-    with np.errstate(invalid="ignore"):  # its standard error is not a number where runs failed
+    """The `statistic` of `samples` (..., n_k) with its interval; each sample is resampled separately."""
+    with np.errstate(invalid="ignore"):  # the standard error is NaN if runs failed
         interval = stats.bootstrap(
             samples,
             statistic,

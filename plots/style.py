@@ -16,7 +16,7 @@ FORMATS = ("png", "pdf")
 
 
 def color_of(algo: str) -> str:
-    # A name that the paper does not have gets a grey that depends on nothing but the name.
+    # A name that the paper does not have gets a grey that depends on the name alone.
     return COLORS.get(algo) or str(0.3 + 0.4 * (sum(algo.encode()) % 8) / 7)
 
 
@@ -35,12 +35,12 @@ def plain(axes: Axes) -> None:
 
 
 def save(figure: Figure, folder: Path, name: str, formats: Sequence[str]) -> list[Path]:
-    """Save as `folder/name` in those of `formats` that are a figure's; characters awkward in a file name become _."""
+    """Save as `folder/name` in the `formats` of figures. Characters that are awkward in a file name become _."""
     folder.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"[^\w+,=.\[\]-]+", "_", name)
     paths = [folder / f"{name}.{suffix}" for suffix in formats if suffix in FORMATS]
     for path in paths:
-        # The whole benchmark has dozens of figures: compress lightly, and lay each out once for both formats.
+        # The whole benchmark has dozens of figures: compress lightly, and compute each layout once for both formats.
         options: dict[str, Any] = {"pil_kwargs": {"compress_level": 2}} if path.suffix == ".png" else {}
         figure.savefig(path, dpi=150, **options)
         figure.set_layout_engine("none")

@@ -1,16 +1,16 @@
-"""Checkpoints: what a seed needs to train on, after any kind of end, exactly as it would have without one.
+"""Checkpoints: a seed resumes from one exactly as if it had never stopped, however the process ended.
 
     seed=<n>/checkpoint/
-        state-<serial>.pt           a moment of the seed; the newest and the one before it are kept
+        state-<serial>.pt           the state of the seed at one moment; the newest two are kept
         replay-<start>-<stop>.f32   transitions `start` to `stop` - 1 as rows of float32, written once
 
-A state file is a line with the SHA-256 of what follows, then a `torch.save` of tensors, numbers and text, read with
-`weights_only`: nothing in it is executed. It names the replay files that belong to it, with their checksums. Each
-file is complete and on disk before the next one names it, and only then is what nobody needs any more deleted; so
-whenever the process dies, a whole checkpoint is there.
+A state file is a line with the SHA-256 of the rest, then a `torch.save` of tensors, numbers and text. It is read with
+`weights_only`, so nothing in it is executed. It names its replay files, with their checksums. Each file is complete
+and on disk before the next one names it, and only then are older files deleted. A crash at any point therefore leaves
+a whole checkpoint.
 
-Seeds trained in lockstep share their `moment`. Taking up all of them at one moment again repeats every bit; any
-other choice would batch them differently, which changes the rounding.
+The seeds of a lockstep group share the `moment` of a checkpoint. If all of them resume from one moment, they repeat
+every bit. Any other choice changes the shape of the batch, and thus the rounding.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class ReplayFile(NamedTuple):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One seed at one moment, as found intact on disk.
+    """The intact checkpoint of one seed.
 
-    `group` are the seeds that trained in lockstep, in order, `step` this one's environment steps, `settings` its
-    configuration; the moments of one process have ascending serial numbers.
+    `group` has the seeds that trained in lockstep, in order. `step` counts this seed's environment steps, `settings` is
+    its configuration. Serial numbers ascend with time.
     """
 
     path: Path
@@ -67,11 +67,11 @@ class Checkpoint:
     replay_files: tuple[ReplayFile, ...]
 
     def state(self) -> dict[str, Any]:
-        """What `CheckpointFolder.write` was given."""
+        """The state that `CheckpointFolder.write` was given."""
         return _load(self.path)["state"]
 
     def fill(self, stretch: Stretch, oldest: int) -> None:
-        """Put the transitions from `oldest` on, the first one that the ring has not overwritten, into `stretch`."""
+        """Copy the transitions from `oldest` on, the first that the buffer holds, into the views of `stretch`."""
         for name, start, stop, _ in self.replay_files:
             kept = max(start, oldest)
             views = stretch(kept, stop)
@@ -84,13 +84,16 @@ class Checkpoint:
 
 
 class CheckpointFolder:
-    """The checkpoints of one run, that is, one seed: `write` one in every folder of the group, then `keep` them all,
-    or `discard` them all. Only this leaves the seeds with a moment that they share, whatever happens when."""
+    """The checkpoints of one run, that is, of one seed.
+
+    Call `write` for every seed of the group, then `keep` (or `discard`) for every seed: a crash at any point leaves a
+    checkpoint that all seeds share.
+    """
 
     def __init__(self, run_folder: str | Path):
         self.folder = Path(run_folder) / "checkpoint"
         self.serial = 0
-        # of the newest state file that is kept, of the one before it, and of one that is neither kept nor discarded yet
+        # The replay files of the newest kept state, of the one before it, and of one not yet kept or discarded.
         self.files: list[ReplayFile] = []
         self.previous_files: list[ReplayFile] = []
         self.written: list[ReplayFile] | None = None
@@ -108,7 +111,7 @@ class CheckpointFolder:
     ) -> None:
         """Write the state and the new transitions of a seed. Its buffer holds `oldest` to `stop` - 1.
 
-        OSError where that fails.
+        Raises OSError if that fails.
         """
         self.folder.mkdir(exist_ok=True)
         files = self._write_replay(stretch, oldest, stop)
@@ -122,12 +125,12 @@ class CheckpointFolder:
         self.written = files
 
     def keep(self) -> None:
-        """Make what was written the newest checkpoint, and delete those that are older than the one before it."""
+        """Make the written checkpoint the newest one, and delete all but the one before it."""
         self.serial, self.files, self.previous_files = self.serial + 1, self.written, self.files
         self.discard()
 
     def discard(self) -> None:
-        """Delete everything but the newest two checkpoints that are kept."""
+        """Delete everything but the newest two kept checkpoints."""
         self.written = None
         used = {self._state_path(serial).name for serial in (self.serial, self.serial - 1)}
         used |= {file.name for file in (*self.files, *self.previous_files)}
@@ -152,12 +155,12 @@ class CheckpointFolder:
         return self.folder / f"state-{serial}.pt"
 
     def read(self) -> tuple[list[Checkpoint], list[str]]:
-        """The intact checkpoints, newest first, and a line for each that is not.
+        """The intact checkpoints, newest first, and a line for each damaged one.
 
-        Raises FormatError where one is of another version of this code.
+        Raises FormatError if one is of another version of this code.
         """
         intact, problems = [], []
-        digests: dict[str, str] = {}  # of replay files: both checkpoints name most of them
+        digests: dict[str, str] = {}  # of replay files, most of which both checkpoints name
         for path in sorted(self.folder.glob("state-*.pt"), key=_serial_of, reverse=True):
             try:
                 content = _load(path)
@@ -183,7 +186,7 @@ class CheckpointFolder:
         return intact, problems
 
     def resume(self, checkpoint: Checkpoint) -> None:
-        """Go on from `checkpoint`; what is newer is deleted, the one before stays until the next has been written."""
+        """Continue from `checkpoint`: delete newer ones, and keep the one before until the next is written."""
         self.serial, self.files, self.previous_files = checkpoint.serial, list(checkpoint.replay_files), []
         for path in self.folder.glob("state-*.pt"):
             if _serial_of(path) > self.serial:
@@ -193,7 +196,7 @@ class CheckpointFolder:
             self.previous_files = [ReplayFile(*file) for file in before["replay_files"]]
 
     def remove(self) -> None:
-        """Delete all of it."""
+        """Delete the folder."""
         if self.folder.is_dir():
             for path in self.folder.iterdir():
                 path.unlink()
@@ -201,7 +204,7 @@ class CheckpointFolder:
 
 
 def saved_step(run_folder: str | Path) -> int:
-    """The environment steps that the newest checkpoint of a run holds, by the names of its files; 0 without one."""
+    """The environment steps in the newest checkpoint of a run, from the names of its files; 0 without one."""
     names = (path.stem for path in Path(run_folder, "checkpoint").glob("replay-*.f32"))
     return max((int(name.rpartition("-")[2]) for name in names), default=0)
 
@@ -209,11 +212,11 @@ def saved_step(run_folder: str | Path) -> int:
 def group_checkpoints(
     intact: Mapping[int, Sequence[Checkpoint]], started: Mapping[int, tuple[int, ...]]
 ) -> tuple[list[dict[int, Checkpoint]], list[int]]:
-    """Which seeds to take up together, each from which checkpoint, and which seeds to start from the beginning.
+    """Groups of seeds that resume together, each seed with its checkpoint, and the seeds that start anew.
 
-    `intact` maps each seed to its checkpoints, newest first; `started` to the group it was started in. The moment that
-    most seeds have comes first, the newest of those: after a death between the writing of two seeds' checkpoints that
-    is the one before. The beginning is a moment like others, as long as no more than one checkpoint followed it.
+    `intact` maps each seed to its checkpoints, newest first; `started` to the group that it started in. Picks the
+    moment that most seeds have, the newest on a tie, and repeats that for the others. (After a crash between two
+    writes, that is the previous moment.) The beginning is a moment too, if at most one checkpoint followed it.
     """
     moments: dict[Any, dict[int, Checkpoint | None]] = {}
     for seed, checkpoints in intact.items():

@@ -1,4 +1,4 @@
-"""Files that are whole at any moment, and errors in one line."""
+"""Writing files safely, and errors as one line."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import IO, Any
 
 
 def replace_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Write a file so that `path` holds the old content or all of the new, whenever the process or the machine dies.
+    """Replace the file `path`: after a crash at any point, it holds the old content or all of the new.
 
-    OSError that names the file where it cannot be written.
+    `write` receives the open file. Raises an OSError that names `path` if it cannot be written.
     """
     temporary = path.with_name(path.name + ".tmp")
     try:
@@ -23,17 +23,17 @@ def replace_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
         temporary.replace(path)
         folder = os.open(path.parent, os.O_RDONLY)
         try:
-            os.fsync(folder)  # makes the new name last
+            os.fsync(folder)  # so that the new name survives a crash
         finally:
             os.close(folder)
     except OSError as error:
         with suppress(OSError):
-            temporary.unlink()  # on a full disk it would be in the way
+            temporary.unlink()  # it would take space on a full disk
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def one_line(error: Exception) -> str:
-    """What `error` says to the user."""
+    """The message of `error` for the user, in one line."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
     return " ".join(str(error).split())

@@ -2,12 +2,12 @@
 
     results/<task>/<variant>/seed=<n>/
         config.yaml      the resolved configuration
-        info.json        versions, git commit, machine, threads, command line, start time; so again for each resumption
+        info.json        versions, git commit, machine, threads, command, start time; again for each resumption
         evaluations.csv  step,return_mean,return_1,...,return_k,seconds: one row an evaluation, appended
         training.csv     step and the algorithm's own measures (SAC: temperature, entropy), from the first update on
         best.pt last.pt  state dicts
         result.json      the final evaluation; written last, so its presence means that the run is finished
-        failed.json      in its place where the run diverged: at which step, what was not finite, last evaluation
+        failed.json      instead of result.json if the run diverged: the step, what was not finite, last evaluation
         checkpoint/      while the run is unfinished: see store/checkpoint.py
     results/<task>/<variant>/seed=<n>.lock
                          while a process trains the run: its process id, host and Slurm job; see store/lock.py
@@ -35,7 +35,7 @@ import yaml
 from store.files import one_line, replace_file
 
 _TABLES = ("evaluations.csv", "training.csv")
-# libyaml's loader is some ten times faster, which counts with two thousand runs; not every wheel has it.
+# libyaml's loader is some ten times faster, which matters for two thousand runs. Not every wheel has it.
 _YamlLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -64,7 +64,7 @@ def run_folder(root: str | Path, task: str, variant: str, seed: int) -> Path:
 
 
 def is_finished(folder: str | Path) -> bool:
-    """Whether the run in `folder` came to its end and has its result."""
+    """Whether the run in `folder` has its result."""
     return Path(folder, "result.json").is_file()
 
 
@@ -74,12 +74,12 @@ def has_failed(folder: str | Path) -> bool:
 
 
 def has_ended(folder: str | Path) -> bool:
-    """Whether nothing is left to do for the run in `folder`: it is finished or has failed."""
+    """Whether the run in `folder` is finished or has failed."""
     return is_finished(folder) or has_failed(folder)
 
 
 def last_evaluated(folder: str | Path) -> int:
-    """The step of the last evaluation of the run in `folder`; 0 where there is none."""
+    """The step of the last evaluation of the run in `folder`; 0 if there is none."""
     try:
         steps = _read_evaluations(Path(folder, "evaluations.csv")).step
     except ValueError:
@@ -88,7 +88,7 @@ def last_evaluated(folder: str | Path) -> int:
 
 
 def read_settings(folder: str | Path) -> dict[str, Any]:
-    """The configuration of the run in `folder`; empty where it cannot be read."""
+    """The configuration of the run in `folder`; empty if it cannot be read."""
     try:
         return _parse(Path(folder, "config.yaml"), lambda text: yaml.load(text, _YamlLoader))
     except ValueError:
@@ -96,7 +96,7 @@ def read_settings(folder: str | Path) -> dict[str, Any]:
 
 
 def lockstep_group(folder: str | Path) -> tuple[int, ...]:
-    """The seeds that the run in `folder` was started with, from its info.json; empty where that does not say."""
+    """The seeds that the run in `folder` started with, from its info.json; empty if they are not there."""
     try:
         return tuple(_parse(Path(folder, "info.json"), json.loads)["lockstep"])
     except (ValueError, KeyError, TypeError):
@@ -106,8 +106,8 @@ def lockstep_group(folder: str | Path) -> tuple[int, ...]:
 class RunWriter:
     """Writes the folder of one run, one seed.
 
-    A folder already there is moved aside to `<folder>.old-<i>`; a finished run only with `replace_finished`,
-    FileExistsError otherwise. `resume` takes up an unfinished one instead.
+    An existing folder is moved aside to `<folder>.old-<i>`. For a finished run, that takes `replace_finished`;
+    otherwise it raises FileExistsError. `resume` continues an unfinished run instead.
     """
 
     def __init__(
@@ -134,12 +134,12 @@ class RunWriter:
     def resume(
         cls, folder: str | Path, config: Mapping[str, Any], info: Mapping[str, Any], eval_episodes: int
     ) -> RunWriter:
-        """The writer of a run taken up again: `restore_tables` is for the trainer to call. `info` joins info.json."""
+        """The writer of a run that resumes. Adds `info` to info.json. The trainer calls `restore_tables`."""
         writer = cls.__new__(cls)
         writer.folder, writer.config, writer.eval_episodes = Path(folder), dict(config), eval_episodes
         try:
             first = _parse(writer.folder / "info.json", json.loads)
-        except ValueError:  # it informs people; nothing that is to come depends on it
+        except ValueError:  # info.json informs people; the training does not depend on it
             first = {}
         writer._save_info(first | {"resumed": [*first.get("resumed", []), dict(info)]})
         writer._save_config()
@@ -150,7 +150,7 @@ class RunWriter:
         return {name: path.read_text() for name in _TABLES if (path := self.folder / name).exists()}
 
     def restore_tables(self, tables: Mapping[str, str]) -> None:
-        """Put the text of `tables` back: rows written since then are gone."""
+        """Put the text of `tables` back, without the rows written since."""
         for name in _TABLES:
             if name in tables:
                 self._replace(name, tables[name])
@@ -175,13 +175,13 @@ class RunWriter:
         self._append("evaluations.csv", row)
 
     def append_statistics(self, step: int, values: Mapping[str, float]) -> None:
-        """Append the algorithm's measures at environment step `step`; their names are the same at every call."""
+        """Append the algorithm's measures at environment step `step`. Their names are the same in every call."""
         if not (self.folder / "training.csv").exists():
             self._append("training.csv", ["step", *values])
         self._append("training.csv", [str(int(step)), *(repr(float(value)) for value in values.values())])
 
     def last_finite_evaluation(self) -> dict[str, float] | None:
-        """Step and mean return of the last evaluation whose mean is finite; None where there is none."""
+        """Step and mean return of the last evaluation with a finite mean; None if there is none."""
         evaluations = _read_evaluations(self.folder / "evaluations.csv")
         finite = np.isfinite(evaluations.return_mean).nonzero()[0]
         if not len(finite):
@@ -190,7 +190,7 @@ class RunWriter:
         return {"step": int(evaluations.step[last]), "return_mean": float(evaluations.return_mean[last])}
 
     def _append(self, name: str, row: Sequence[str]) -> None:
-        # One write of one line: a reader meanwhile sees it whole, or without its line end.
+        # One write for one line: a simultaneous reader sees it whole, or without its line end.
         path = self.folder / name
         try:
             with open(path, "a") as file:
@@ -202,7 +202,7 @@ class RunWriter:
         """Replace `best.pt` or `last.pt` (`name` "best" or "last") in one step."""
         if name not in ("best", "last"):
             raise ValueError(f"parameters are saved as 'best' or 'last', not {name!r}")
-        import torch  # here alone: reading results needs no torch
+        import torch  # only here: reading results needs no torch
 
         replace_file(self.folder / f"{name}.pt", lambda file: torch.save(dict(state_dict), file))
 
@@ -260,7 +260,7 @@ def find_runs(root: str | Path) -> list[Path]:
 
 
 def read_run(folder: str | Path) -> Run:
-    """Read a run, also one in progress. Raises ValueError that names the file which is missing or corrupt."""
+    """Read a run, finished or in progress. Raises a ValueError that names a missing or corrupt file."""
     folder = Path(folder)
     variant = folder.parent.name
     algo, overrides = parse_variant(variant)
@@ -292,7 +292,7 @@ def read_run(folder: str | Path) -> Run:
 def read_results(
     root: str | Path, tasks: Collection[str] | None = None, algos: Collection[str] | None = None
 ) -> tuple[list[Run], list[str]]:
-    """All readable runs below `root` (of the given tasks and algorithms), and a line for each that is not."""
+    """All readable runs below `root`, of the given tasks and algorithms, and a line for each unreadable one."""
     runs, problems = [], []
     for folder in find_runs(root):
         if tasks is not None and folder.parent.parent.name not in tasks:
@@ -307,7 +307,7 @@ def read_results(
 
 
 def describe_failure(failure: Mapping[str, Any]) -> str:
-    """One line that says what `failed.json` records."""
+    """The content of `failed.json` in one line."""
     return f"failed at step {failure['step']}: {failure['quantity']}"
 
 
@@ -332,7 +332,7 @@ def _read_training(path: Path) -> dict[str, np.ndarray]:
     if not path.exists():
         return {}
     columns, table = _read_rows(path)
-    if columns == [""]:  # made at this moment, its header not written yet
+    if columns == [""]:  # the writer has not written the header yet
         return {}
     if columns[0] != "step":
         raise ValueError(f"{path}: not the header of a training file")
@@ -344,7 +344,7 @@ def _read_rows(path: Path) -> tuple[list[str], np.ndarray]:
     try:
         header, *lines = path.read_text().split("\n")
         columns = header.split(",")
-        # What follows the last line end is empty, or a row being written at this moment.
+        # The text after the last line end is empty, or a row that is being written.
         rows = [[float(x) for x in line.split(",")] for line in lines[:-1]]
         if any(len(row) != len(columns) for row in rows):
             raise ValueError("a row does not have the header's number of columns")

@@ -1,4 +1,4 @@
-"""One process a run: a lock that dies with its owner and tells others who that is."""
+"""One process for each run: a lock that ends with its owner and names the owner to others."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from store import slurm
 
 
 class LockedError(RuntimeError):
-    """Another process trains this run; the message names it."""
+    """Another process trains this run. The message names it."""
 
 
 @contextmanager
 def run_lock(run_folder: Path) -> Iterator[None]:
-    """Holds `<run folder>.lock` while the context is open; LockedError where another process has it.
+    """Hold `<run folder>.lock` while the context is open. Raises LockedError if another process holds it.
 
-    The operating system's lock on the open file says whether an owner on this host is alive: it ends with the process,
-    however that ends. The file's text names the owner. Not every network file system passes locks on to other hosts,
-    so a file that another host left there counts as held, unless its owner belonged to a Slurm job that is over.
+    The operating system's lock on the open file tells whether an owner on this host is alive, because it ends with the
+    process. The file's text names the owner. Not every network file system passes locks on to other hosts, so the file
+    of another host counts as held, unless its owner belonged to a Slurm job that has ended.
     """
 
     path = run_folder.with_name(run_folder.name + ".lock")
@@ -46,7 +46,7 @@ def run_lock(run_folder: Path) -> Iterator[None]:
 
 
 def lock_owner(run_folder: Path) -> str | None:
-    """Who trains the run, as far as its lock file tells; None where nobody does. The lock itself is left alone."""
+    """The process that trains the run, from its lock file; None if there is none. Does not touch the lock."""
     try:
         owner = _parse(run_folder.with_name(run_folder.name + ".lock").read_bytes())
     except OSError:
@@ -58,7 +58,7 @@ def lock_owner(run_folder: Path) -> str | None:
 
 
 def _acquire(path: Path, run_folder: Path) -> int | None:
-    """The descriptor of the locked file; None if it was deleted or changed hands since we opened it."""
+    """The descriptor of the locked file; None if the file was deleted or got another owner since we opened it."""
     file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         owner, here = _read_owner(file), socket.gethostname()
@@ -76,7 +76,7 @@ def _acquire(path: Path, run_folder: Path) -> int | None:
             raise LockedError(f"{run_folder} is being trained by {name}")
         if owner and owner["host"] != here and not _job_is_over(owner):
             raise LockedError(f"{run_folder} is being trained by {name}; if that has ended, delete {path}")
-        # While Slurm was asked, another host may have taken the file over without our noticing.
+        # Another host may have taken the file over while Slurm answered.
         unchanged = _read_owner(file) == owner
         if unchanged and path.exists() and os.path.samestat(os.stat(path), os.fstat(file)):
             return file
@@ -99,7 +99,7 @@ def _parse(text: bytes) -> dict[str, Any] | None:
             job = {"cluster": str(job["cluster"]), "id": str(job["id"]), "restarts": int(job["restarts"])}
         return {"pid": int(owner["pid"]), "host": str(owner["host"]), "job": job}
     except (ValueError, KeyError, TypeError, AttributeError):
-        return None  # just created, or not written by us
+        return None  # the file is new, or another program wrote it
 
 
 def _name(owner: dict[str, Any]) -> str:
@@ -117,4 +117,4 @@ def _is_alive(pid: int) -> bool:
         return False
     except PermissionError:
         return True
-    return pid != os.getpid()  # a namesake of ours in a container before this one
+    return pid != os.getpid()  # our own number: the owner was a process of an earlier container

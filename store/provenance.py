@@ -17,7 +17,7 @@ _PACKAGES = ("torch", "numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omeg
 
 
 def describe_environment(command: Sequence[str]) -> dict[str, Any]:
-    """What `info.json` says: versions, git commit, command line, start time; no path of this machine."""
+    """The content of `info.json`: versions, git commit, command, start time. It names no path of this machine."""
     versions: dict[str, str | None] = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -29,7 +29,7 @@ def describe_environment(command: Sequence[str]) -> dict[str, Any]:
         "versions": versions,
         "commit": described and described.removesuffix("-dirty"),
         "dirty": described and described.endswith("-dirty"),
-        # Absolute paths, alone or after `key=`, are cut to their last part.
+        # An absolute path, alone or after `key=`, is cut to its last part.
         "command": shlex.join(re.sub(r"(^|=)/.*/(?=.)", r"\1", word) for word in command),
         "platform": platform.platform(),
         "processor": processor(),
@@ -54,7 +54,7 @@ def _git_describe() -> str | None:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.strip()
 
     try:
-        # Installed into an environment that lies in another repository, this file is not that repository's.
+        # If the package is installed in an environment inside another repository, git would describe that one.
         git("ls-files", "--error-unmatch", Path(__file__).name)
         return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
     except (OSError, subprocess.SubprocessError):

@@ -64,13 +64,15 @@ def _rate(task: str, algo: str) -> Rate:
     return Rate(*map(statistics.mean, zip(*(near or same_robot.values() or _rates().values()), strict=True)))
 
 
-def seconds(config: Config, seeds: int, start: int = 0) -> float:
-    """Time of training `seeds` seeds in lockstep from step `start` to the end, on one core."""
+def seconds(config: Config, paper: Config, seeds: int, start: int = 0) -> float:
+    """Time of training `seeds` seeds in lockstep from step `start` to the end, on one core.
+
+    `paper` is the paper's configuration of the same cell, whose rate was measured.
+    """
     rate, robot = _rate(config.env, config.algo), _robot(config)
     step = 1e-3 * rate.step_ms * (seeds + STEP_OVERHEAD) / (SEEDS + STEP_OVERHEAD)
     update = 1e-3 * rate.update_ms * (seeds + UPDATE_OVERHEAD) / (SEEDS + UPDATE_OVERHEAD)
-    measured = paper_config(config.algo, config.env).batch_size
-    update *= (config.batch_size + BATCH_OVERHEAD) / (measured + BATCH_OVERHEAD)
+    update *= (config.batch_size + BATCH_OVERHEAD) / (paper.batch_size + BATCH_OVERHEAD)
     rollout = config.train_freq if isinstance(config.train_freq, int) else robot.max_episode_steps
     per_step = 1.0 if config.gradient_steps == -1 else config.gradient_steps / rollout
     updates = per_step * (config.steps - max(start, config.learning_starts))
@@ -108,9 +110,9 @@ def corrections(runs: Iterable[Run], device: str) -> dict[tuple[str, str], float
         except (KeyError, TypeError, ValueError):
             continue
         same_device = config.device.partition(":")[0] == device.partition(":")[0]
-        same_layers = config.hidden == paper_config(run.algo, run.task).hidden
-        if same_device and same_layers and steps >= TELLING_STEPS:
-            ratio = took / seconds(config, seeds)
+        paper = paper_config(run.algo, run.task)
+        if same_device and config.hidden == paper.hidden and steps >= TELLING_STEPS:
+            ratio = took / seconds(config, paper, seeds)
             ratios.setdefault((run.task, run.algo), []).append(ratio)
             ratios.setdefault(("", ""), []).append(ratio)
     return {key: statistics.median(values) for key, values in ratios.items()}

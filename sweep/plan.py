@@ -23,7 +23,7 @@ class Entry:
 
     def seconds(self, start: int) -> float:
         """Estimated time of the training from step `start` on, on one core."""
-        return self.factor * estimates.seconds(self.cell.config, len(self.cell.seeds), start)
+        return self.factor * estimates.seconds(self.cell.config, self.cell.paper, len(self.cell.seeds), start)
 
     @property
     def remaining(self) -> float:

@@ -7,6 +7,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before PyTorch is imported; the
 
 import pytest
 import torch
+from helpers import CHECKPOINTED, outcome, train
 from hypothesis import settings
 
 settings.register_profile("ci", max_examples=40, deadline=None)
@@ -21,3 +22,11 @@ def denormal_numbers():
     """Training flushes them to zero in the whole process; the tests after it may need them."""
     yield
     torch.set_flush_denormal(False)
+
+
+@pytest.fixture(scope="session")
+def unbroken(tmp_path_factory):
+    """The outcome of the cell `CHECKPOINTED`, trained without an interruption."""
+    root = tmp_path_factory.mktemp("unbroken")
+    train(root, CHECKPOINTED)
+    return outcome(root)

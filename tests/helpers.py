@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 import torch
 
 import plot
@@ -16,6 +17,13 @@ from sweep.train import train as train_cell
 
 run_command = run.main
 """What `python run.py` does with a list of words; the exit code."""
+
+
+CHECKPOINTED = (
+    "algo=DPre env=R+N seed=3,5 steps=60 learning_starts=20 batch_size=4 hidden=[8,8] eval_every=30 eval_episodes=1"
+    " final_episodes=1 checkpoint_every=10 train_freq=1 gradient_steps=1"
+)
+"""A short cell of two seeds with many checkpoints."""
 
 
 class Breaks:
@@ -125,3 +133,16 @@ def write_run(root, task, algo, seed, result=None, overrides=None, evaluations=4
     if result is not None:
         writer.finish({"return_mean": result, "returns": [result] * 50})
     return writer
+
+
+def break_off(root, calls=100):
+    """Run the command up to a crash, which leaves two checkpoints a seed; those seeds' folders."""
+    with pytest.raises(ZeroDivisionError):
+        train(root, CHECKPOINTED, Breaks(calls, error=ZeroDivisionError()))
+    folders = sorted(root.glob("*/*/seed=?"))
+    assert [len(list(folder.glob("checkpoint/state-*.pt"))) for folder in folders] == [2, 2]
+    return folders
+
+
+def outcome_files(root):
+    return {path: path.read_bytes() for path in root.glob("*/*/seed=?/*.*")}

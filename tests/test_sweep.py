@@ -203,7 +203,7 @@ def test_finished_runs_correct_the_estimates(tmp_path):
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text("algo: DPre\nenv: R+N\nseed: '0'\nsteps: 300000\n")
     (folder / "evaluations.csv").write_text("step,return_mean,return_1,seconds\n")
-    took = 3.0 * estimates.seconds(Config("DPre", "R+N", steps=300_000), 1)
+    took = 3.0 * estimates.seconds(Config("DPre", "R+N", steps=300_000), entry.cell.paper, 1)
     result = {"return_mean": 1.0, "seeds_in_lockstep": 1, "seconds": {"total": took}}
     for steps in (estimates.TELLING_STEPS - 1, estimates.TELLING_STEPS):
         assert after_a_run_of(steps, result, folder, words, tmp_path, before) == (steps >= estimates.TELLING_STEPS)

@@ -1,13 +1,10 @@
-"""What goes wrong around a run: damaged checkpoints, full disks, second processes, signals, clocks."""
+"""Checkpoints: damage, the choice among them, what they keep, and resumptions from them."""
 
-import errno
 import hashlib
 import io
 import json
 import os
 import pickle
-import signal
-import socket
 import subprocess
 import sys
 import time
@@ -16,43 +13,28 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import Breaks, assert_identical, outcome, run_command, train, train_through
+from helpers import (
+    CHECKPOINTED,
+    Breaks,
+    assert_identical,
+    break_off,
+    outcome,
+    outcome_files,
+    run_command,
+    train,
+    train_through,
+)
 
 from algos.td3 import TD3
 from core.replay import Batch, Replay
 from store import folder as results
 from store.checkpoint import Checkpoint, CheckpointFolder, group_checkpoints
-from store.interrupt import Interrupted, Interrupts
-from store.lock import LockedError, run_lock
 
 ROOT = Path(__file__).parents[1]
-WORDS = (
-    "algo=DPre env=R+N seed=3,5 steps=60 learning_starts=20 batch_size=4 hidden=[8,8] eval_every=30 eval_episodes=1"
-    " final_episodes=1 checkpoint_every=10 train_freq=1 gradient_steps=1"
-)
-
-
-@pytest.fixture(scope="module")
-def unbroken(tmp_path_factory):
-    root = tmp_path_factory.mktemp("unbroken")
-    train(root, WORDS)
-    return outcome(root)
-
-
-def break_off(root, calls=100):
-    """Run the command up to a crash, which leaves two checkpoints a seed; those seeds' folders."""
-    with pytest.raises(ZeroDivisionError):
-        train(root, WORDS, Breaks(calls, error=ZeroDivisionError()))
-    folders = sorted(root.glob("*/*/seed=?"))
-    assert [len(list(folder.glob("checkpoint/state-*.pt"))) for folder in folders] == [2, 2]
-    return folders
 
 
 def newest(folder, pattern):
     return max((folder / "checkpoint").glob(pattern), key=lambda path: int(path.stem.split("-")[1]))
-
-
-# ---------------------------------------------------------------- damaged checkpoints
 
 
 def flip(path):
@@ -73,7 +55,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(tmp_path, capsys, unbr
     newest_state = newest(first, "state-*.pt")
     damage(damaged)
     capsys.readouterr()
-    train(tmp_path, WORDS)
+    train(tmp_path, CHECKPOINTED)
     captured = capsys.readouterr()
     steps = [int(line.rpartition(" ")[2]) for line in captured.out.splitlines() if "resuming from step" in line]
     assert len(steps) == 2 and steps[0] == steps[1] and steps[0] % 10 == 0
@@ -86,7 +68,7 @@ def test_without_a_whole_checkpoint_a_run_starts_again_and_the_old_one_is_kept(t
     first, second = break_off(tmp_path)
     for path in first.glob("checkpoint/state-*.pt"):
         flip(path)
-    train(tmp_path, WORDS)
+    train(tmp_path, CHECKPOINTED)
     captured = capsys.readouterr()
     assert captured.err.count("damaged checkpoint: wrong checksum") == 2
     assert "other seeds before" in captured.out and captured.out.count("resuming") == 1
@@ -112,12 +94,9 @@ def test_a_checkpoint_executes_nothing(tmp_path, capsys, monkeypatch, unbroken):
         checkpoints, problems = CheckpointFolder(first).read()
         assert len(checkpoints) == 1 and len(problems) == 1 and problems[0].startswith(f"{path}: damaged checkpoint: ")
         assert "\n" not in problems[0]
-    train(tmp_path, WORDS)
+    train(tmp_path, CHECKPOINTED)
     assert not (tmp_path / "executed").exists()
     assert_identical(outcome(tmp_path), unbroken)
-
-
-# ---------------------------------------------------------------- which checkpoints to take
 
 
 def kept(serial, moment, group, step=0):
@@ -192,7 +171,7 @@ def test_checkpoints_after_a_resumption_join_those_before_it(tmp_path):
     serials = sorted(int(path.stem.split("-")[1]) for path in first.glob("checkpoint/state-*.pt"))
     replay_files = {path.name for path in first.glob("checkpoint/*.f32")}
     with pytest.raises(ZeroDivisionError):
-        train(tmp_path, WORDS, Breaks(200, error=ZeroDivisionError()))
+        train(tmp_path, CHECKPOINTED, Breaks(200, error=ZeroDivisionError()))
     later = sorted(int(path.stem.split("-")[1]) for path in first.glob("checkpoint/state-*.pt"))
     assert later[0] == later[1] - 1 and serials[1] < later[1] <= serials[1] + 3
     assert replay_files < {path.name for path in first.glob("checkpoint/*.f32")}
@@ -203,17 +182,17 @@ def test_settings_that_changed_are_not_mixed(tmp_path, capsys, monkeypatch):
     folder, _ = break_off(tmp_path)
     monkeypatch.setitem(TD3.paper["Reacher"], "tau", 0.5)
     capsys.readouterr()
-    assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 2
+    assert run_command([*CHECKPOINTED.split(), f"results={tmp_path}"]) == 2
     err = capsys.readouterr().err
     assert f"{folder} was started with tau=0.005, which is 0.5 now; overwrite=true" in err and err.count("\n") == 1
-    assert run_command([*WORDS.split(), f"results={tmp_path}", "overwrite=true"]) == 0
+    assert run_command([*CHECKPOINTED.split(), f"results={tmp_path}", "overwrite=true"]) == 0
     assert (folder.parent / "seed=3.old-1" / "checkpoint").is_dir() and (folder / "result.json").is_file()
 
 
 def test_another_grouping_goes_on_from_the_checkpoints_too(tmp_path, capsys, unbroken):
     folder, other = break_off(tmp_path)
     capsys.readouterr()
-    alone = WORDS.replace("seed=3,5", "seed=3")
+    alone = CHECKPOINTED.replace("seed=3,5", "seed=3")
     train(tmp_path, alone)
     assert f"{folder}: resuming from step" in (out := capsys.readouterr().out) and "equal up to rounding" in out
     assert (other / "checkpoint").is_dir() and not (folder / "checkpoint").exists()
@@ -221,7 +200,7 @@ def test_another_grouping_goes_on_from_the_checkpoints_too(tmp_path, capsys, unb
     assert result["steps"] == 60 and result["gradient_steps"] == unbroken["seed=3"]["result"]["gradient_steps"]
     for name, parameter in torch.load(folder / "last.pt", weights_only=True).items():
         torch.testing.assert_close(parameter, unbroken["seed=3"]["parameters"]["last"][name], rtol=0, atol=1e-4)
-    train(tmp_path, WORDS)
+    train(tmp_path, CHECKPOINTED)
     assert "already finished" in (out := capsys.readouterr().out) and f"{other}: resuming from step" in out
     assert set(outcome(tmp_path)) == {"seed=3", "seed=5"}
 
@@ -230,229 +209,18 @@ def test_what_a_death_after_the_last_result_leaves_is_cleared_away(tmp_path, mon
     with monkeypatch.context() as patch:
         patch.setattr(CheckpointFolder, "remove", lambda self: 1 / 0)
         with pytest.raises(ZeroDivisionError):
-            train(tmp_path, WORDS)
+            train(tmp_path, CHECKPOINTED)
     assert len(list(tmp_path.glob("*/*/seed=?/checkpoint"))) == 2
     before = outcome_files(tmp_path)
-    assert train(tmp_path, WORDS)
+    assert train(tmp_path, CHECKPOINTED)
     assert not list(tmp_path.glob("*/*/seed=?/checkpoint")) and outcome_files(tmp_path) == before
-
-
-def outcome_files(root):
-    return {path: path.read_bytes() for path in root.glob("*/*/seed=?/*.*")}
-
-
-# ---------------------------------------------------------------- disks
-
-
-def no_space(*_):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-@pytest.mark.parametrize("failing", ["state-3.pt", "state-4.pt", "replay-"])
-def test_a_disk_without_room_for_a_checkpoint_does_not_end_the_training(
-    tmp_path, capsys, monkeypatch, unbroken, failing
-):
-    fsync, refused = os.fsync, []
-
-    def full(descriptor):
-        name = os.readlink(f"/proc/self/fd/{descriptor}")
-        if failing in name and "seed=5" in name and len(refused) < 3:
-            refused.append(name)
-            no_space()
-        fsync(descriptor)
-
-    monkeypatch.setattr(os, "fsync", full)
-    train(tmp_path, WORDS)
-    err = capsys.readouterr().err
-    assert refused and err.count("no checkpoint at step") == len(refused) and "no space left on device" in err.lower()
-    assert not list(tmp_path.rglob("*.tmp"))
-    assert_identical(outcome(tmp_path), unbroken)
-
-
-def test_checkpoints_that_did_not_fit_leave_the_seeds_with_a_moment_that_they_share(tmp_path, monkeypatch, unbroken):
-    """Seed 3's file fits each time, seed 5's never does."""
-    first, second = break_off(tmp_path)
-    fsync = os.fsync
-
-    def full(descriptor):
-        if "seed=5/checkpoint" in os.readlink(f"/proc/self/fd/{descriptor}"):
-            no_space()
-        fsync(descriptor)
-
-    before = [[path.name for path in sorted(folder.glob("checkpoint/state-*"))] for folder in (first, second)]
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(ZeroDivisionError):
-            train(
-                tmp_path,
-                WORDS.replace("checkpoint_every=10", "checkpoint_every=2"),
-                Breaks(200, error=ZeroDivisionError()),
-            )
-    after = [[path.name for path in sorted(folder.glob("checkpoint/state-*"))] for folder in (first, second)]
-    assert after == before
-    train(tmp_path, WORDS)
-    assert_identical(outcome(tmp_path), unbroken)
-
-
-def test_after_a_checkpoint_that_did_not_fit_the_one_before_is_whole(tmp_path, monkeypatch, unbroken):
-    def fill_disk():
-        check()
-        if check.calls == 90:
-            monkeypatch.setattr(os, "fsync", no_space)
-
-    check = Breaks(100, error=ZeroDivisionError())
-    with pytest.raises(ZeroDivisionError):
-        train(tmp_path, WORDS, fill_disk)
-    monkeypatch.undo()
-    train(tmp_path, WORDS)
-    assert_identical(outcome(tmp_path), unbroken)
-
-
-def test_a_result_that_cannot_be_written_ends_the_run_with_one_line_and_it_can_be_resumed(
-    tmp_path, capsys, monkeypatch, unbroken
-):
-    def fill_disk(writer, name, row):
-        path = writer.folder / name
-        path.unlink()
-        path.symlink_to("/dev/full")
-        append(writer, name, row)
-
-    append = results.RunWriter._append
-    with monkeypatch.context() as patch:
-        patch.setattr(results.RunWriter, "_append", fill_disk)
-        assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 2
-    err = capsys.readouterr().err
-    (table,) = [path for path in tmp_path.glob("*/*/seed=?/evaluations.csv") if path.is_symlink()]
-    assert err.splitlines()[-1] == f"run.py: {table}: no space left on device" and "Traceback" not in err
-    table.unlink()
-    train(tmp_path, WORDS)
-    assert_identical(outcome(tmp_path), unbroken)
-
-
-# ---------------------------------------------------------------- two processes on one run
-
-
-def test_a_run_in_progress_is_left_to_its_process(tmp_path, capsys):
-    _, folder = break_off(tmp_path)
-    capsys.readouterr()
-    with run_lock(folder):
-        before = outcome_files(tmp_path)
-        assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 2
-        assert run_command([*WORDS.split(), f"results={tmp_path}", "overwrite=true"]) == 2
-        err = capsys.readouterr().err
-        said = f"run.py: {folder} is being trained by process {os.getpid()} on {socket.gethostname()}\n"
-        assert err == 2 * said
-        assert outcome_files(tmp_path) == before
-    assert not list(tmp_path.rglob("*.lock"))  # the other seed's too
-    assert run_command([*WORDS.split(), f"results={tmp_path}"]) == 0
-
-
-def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
-    lock = tmp_path / "seed=1.lock"
-    lock.write_text(json.dumps({"pid": 1, "host": socket.gethostname()}))
-    with run_lock(tmp_path / "seed=1"):
-        assert json.loads(lock.read_text())["pid"] == os.getpid()
-    lock.write_text("nothing that can be read")
-    with run_lock(tmp_path / "seed=1"):
-        assert json.loads(lock.read_text()) == {"pid": os.getpid(), "host": socket.gethostname()}
-    assert not lock.exists()
-
-
-def test_the_lock_of_another_host_is_for_a_person_to_delete(tmp_path):
-    lock = tmp_path / "seed=1.lock"
-    lock.write_text(json.dumps({"pid": 7, "host": "node-12"}))
-    with pytest.raises(LockedError, match=rf"by process 7 on node-12; if that has ended, delete {lock}"):
-        run_lock(tmp_path / "seed=1").__enter__()
-    assert lock.exists()
-
-
-def test_where_files_cannot_be_locked_the_process_id_decides(tmp_path, monkeypatch):
-    def unsupported(*_):
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    monkeypatch.setattr("fcntl.flock", unsupported)
-    lock = tmp_path / "seed=1.lock"
-    lock.write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
-    with pytest.raises(LockedError, match=f"by process {os.getppid()} on "):
-        run_lock(tmp_path / "seed=1").__enter__()
-    ended = subprocess.Popen(["true"])
-    ended.wait()
-    lock.write_text(json.dumps({"pid": ended.pid, "host": socket.gethostname()}))
-    with run_lock(tmp_path / "seed=1"):
-        assert json.loads(lock.read_text())["pid"] == os.getpid()
-
-
-def test_a_lock_that_its_owner_deletes_meanwhile_is_no_lock(tmp_path, monkeypatch):
-    import fcntl
-
-    lock, flock, calls = tmp_path / "seed=1.lock", fcntl.flock, []
-
-    def race(file, how):
-        if not calls:
-            lock.unlink()  # the owner lets go between our opening and our locking
-        calls.append(how)
-        return flock(file, how)
-
-    monkeypatch.setattr("fcntl.flock", race)
-    with run_lock(tmp_path / "seed=1"):
-        assert len(calls) == 2 and json.loads(lock.read_text())["pid"] == os.getpid()
-
-
-# ---------------------------------------------------------------- signals and clocks
-
-
-def script(code):
-    return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
-
-
-def test_a_second_signal_ends_the_process_at_once():
-    done = script(
-        "import os, signal\n"
-        "from store.interrupt import Interrupted, Interrupts\n"
-        "with Interrupts() as interrupts:\n"
-        "    interrupts.stop_if_asked()\n"
-        "    os.kill(os.getpid(), signal.SIGTERM)\n"
-        "    try:\n"
-        "        interrupts.stop_if_asked()\n"
-        "    except Interrupted as interrupted:\n"
-        "        print('noted', interrupted.signum, flush=True)\n"
-        "    os.kill(os.getpid(), signal.SIGTERM)\n"
-        "    print('never', flush=True)\n"
-    )
-    assert done.returncode == -signal.SIGTERM and done.stdout.split() == ["noted", "15"]
-
-
-def test_handlers_are_put_back_and_an_ignored_signal_stays_ignored():
-    done = script(
-        "import os, signal\n"
-        "from store.interrupt import Interrupts\n"
-        "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-        "with Interrupts() as interrupts:\n"
-        "    os.kill(os.getpid(), signal.SIGINT)\n"
-        "    interrupts.stop_if_asked()\n"
-        "print(signal.getsignal(signal.SIGTERM) == signal.SIG_DFL, signal.getsignal(signal.SIGINT) == signal.SIG_IGN)\n"
-    )
-    assert done.returncode == 0 and done.stdout.split() == ["True", "True"], done.stderr
-
-
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_the_exit_code_says_which_signal(tmp_path, capsys, monkeypatch, signum, unbroken):
-    check = Breaks(77, error=Interrupted(signum))
-    monkeypatch.setattr(Interrupts, "stop_if_asked", lambda self: check())
-    words = [*WORDS.split(), f"results={tmp_path}"]
-    assert run_command(words) == 128 + signum
-    captured = capsys.readouterr()
-    assert "interrupted at step" in captured.err and "the same command resumes" in captured.err
-    assert run_command(words) == 0
-    assert capsys.readouterr().out.count("resuming from step") == 2
-    assert_identical(outcome(tmp_path), unbroken)
 
 
 def test_a_clock_that_jumps_changes_nothing(tmp_path, monkeypatch, unbroken):
     now = time.time()
     jumps = iter(range(10**9))
     monkeypatch.setattr(time, "time", lambda: now + 1e7 * (-1) ** next(jumps))
-    assert train_through(tmp_path, WORDS, Breaks(60)) == 1
+    assert train_through(tmp_path, CHECKPOINTED, Breaks(60)) == 1
     assert_identical(outcome(tmp_path), unbroken)
     for folder in tmp_path.glob("*/*/seed=?"):
         trained = results.read_run(folder)
@@ -461,7 +229,7 @@ def test_a_clock_that_jumps_changes_nothing(tmp_path, monkeypatch, unbroken):
 
 
 def test_every_resumption_is_on_record(tmp_path):
-    train_through(tmp_path, WORDS, Breaks(60, 90))
+    train_through(tmp_path, CHECKPOINTED, Breaks(60, 90))
     for folder in tmp_path.glob("*/*/seed=?"):
         info = json.loads((folder / "info.json").read_text())
         assert info["lockstep"] == [3, 5] and len(info["resumed"]) == 2

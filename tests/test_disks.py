@@ -1,0 +1,94 @@
+"""Full disks: training continues where it can, and a command that fails says so in one line."""
+
+import errno
+import os
+
+import pytest
+from helpers import CHECKPOINTED, Breaks, assert_identical, break_off, outcome, run_command, train
+
+from store import folder as results
+
+
+def no_space(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("failing", ["state-3.pt", "state-4.pt", "replay-"])
+def test_a_disk_without_room_for_a_checkpoint_does_not_end_the_training(
+    tmp_path, capsys, monkeypatch, unbroken, failing
+):
+    fsync, refused = os.fsync, []
+
+    def full(descriptor):
+        name = os.readlink(f"/proc/self/fd/{descriptor}")
+        if failing in name and "seed=5" in name and len(refused) < 3:
+            refused.append(name)
+            no_space()
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", full)
+    train(tmp_path, CHECKPOINTED)
+    err = capsys.readouterr().err
+    assert refused and err.count("no checkpoint at step") == len(refused) and "no space left on device" in err.lower()
+    assert not list(tmp_path.rglob("*.tmp"))
+    assert_identical(outcome(tmp_path), unbroken)
+
+
+def test_checkpoints_that_did_not_fit_leave_the_seeds_with_a_moment_that_they_share(tmp_path, monkeypatch, unbroken):
+    """Seed 3's file fits each time, seed 5's never does."""
+    first, second = break_off(tmp_path)
+    fsync = os.fsync
+
+    def full(descriptor):
+        if "seed=5/checkpoint" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            no_space()
+        fsync(descriptor)
+
+    before = [[path.name for path in sorted(folder.glob("checkpoint/state-*"))] for folder in (first, second)]
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(ZeroDivisionError):
+            train(
+                tmp_path,
+                CHECKPOINTED.replace("checkpoint_every=10", "checkpoint_every=2"),
+                Breaks(200, error=ZeroDivisionError()),
+            )
+    after = [[path.name for path in sorted(folder.glob("checkpoint/state-*"))] for folder in (first, second)]
+    assert after == before
+    train(tmp_path, CHECKPOINTED)
+    assert_identical(outcome(tmp_path), unbroken)
+
+
+def test_after_a_checkpoint_that_did_not_fit_the_one_before_is_whole(tmp_path, monkeypatch, unbroken):
+    def fill_disk():
+        check()
+        if check.calls == 90:
+            monkeypatch.setattr(os, "fsync", no_space)
+
+    check = Breaks(100, error=ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        train(tmp_path, CHECKPOINTED, fill_disk)
+    monkeypatch.undo()
+    train(tmp_path, CHECKPOINTED)
+    assert_identical(outcome(tmp_path), unbroken)
+
+
+def test_a_result_that_cannot_be_written_ends_the_run_with_one_line_and_it_can_be_resumed(
+    tmp_path, capsys, monkeypatch, unbroken
+):
+    def fill_disk(writer, name, row):
+        path = writer.folder / name
+        path.unlink()
+        path.symlink_to("/dev/full")
+        append(writer, name, row)
+
+    append = results.RunWriter._append
+    with monkeypatch.context() as patch:
+        patch.setattr(results.RunWriter, "_append", fill_disk)
+        assert run_command([*CHECKPOINTED.split(), f"results={tmp_path}"]) == 2
+    err = capsys.readouterr().err
+    (table,) = [path for path in tmp_path.glob("*/*/seed=?/evaluations.csv") if path.is_symlink()]
+    assert err.splitlines()[-1] == f"run.py: {table}: no space left on device" and "Traceback" not in err
+    table.unlink()
+    train(tmp_path, CHECKPOINTED)
+    assert_identical(outcome(tmp_path), unbroken)

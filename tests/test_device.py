@@ -29,6 +29,8 @@ def operations(constraint: Constraint, obs: Tensor, action: Tensor, std: Tensor)
         "alpha_log_prob": ray.alpha_log_prob(0.5 * action, std),
         "alpha_log_prob in the unit ball": ray.alpha_log_prob(0.5 * action, std, unit_ball=True),
         "radial_log_prob": ray.radial_log_prob(action.sum(-1), floor=1e-6),
+        "gauge_map": ray.gauge_map(),
+        "gauge_log_prob": ray.gauge_log_prob(action.sum(-1)),
         "linear_oracle": constraint.linear_oracle(obs, action),
         "penalty": constraint.penalty(obs, action),
         "violation": constraint.violation(obs, action),

@@ -9,17 +9,14 @@ import pytest
 import torch
 from torch import nn
 
-import core.moments
 from algos import ALGORITHMS
 from constraints import WeightedPositivePart
 from core.agent import Agent
-from core.config import Config, ConfigError
+from core.config import Config
 from core.maps import Alpha
 from core.random import Streams
 from core.trainer import Trainer
-from store.checkpoint import CheckpointFolder
 from store.folder import RunWriter, is_finished, read_run
-from store.interrupt import Interrupted
 
 OBS, DIM = 3, 2
 LENGTHS = (5, 7)  # of every other episode; the shorter ones terminate, the longer ones are cut off
@@ -439,23 +436,3 @@ def test_an_algorithm_without_statistics_leaves_no_table(tmp_path):
     trainer = make_trainer(tmp_path)
     trainer.run()
     assert not (folder(trainer) / "training.csv").exists()
-
-
-def test_a_checkpoint_of_another_version_is_refused_with_a_clear_message(tmp_path, monkeypatch):
-    def stop():
-        if trainer.seeds[0].steps == 30:
-            raise Interrupted(15)
-
-    trainer = make_trainer(tmp_path)
-    trainer.stop_if_asked = stop
-    with pytest.raises(Interrupted):
-        trainer.run()
-    (checkpoint,), _ = CheckpointFolder(folder(trainer)).read()
-    again = make_trainer(tmp_path / "again")
-    again.restore([checkpoint])
-    assert again.seeds[0].steps == 30 and again.agent.net.count.item() == 20 - 1
-    monkeypatch.setattr(core.moments, "STATE_FORMAT", 99)
-    refused = make_trainer(tmp_path / "refused")
-    with pytest.raises(ConfigError, match="another version of this program.*overwrite=true"):
-        refused.restore([checkpoint])
-    assert refused.seeds[0].steps == 0

@@ -15,8 +15,11 @@ from core.agent import Agent
 from core.config import Config
 from core.maps import Alpha
 from core.random import Streams
+from core.seed import COUNTERS
 from core.trainer import Trainer
+from store.checkpoint import CheckpointFolder
 from store.folder import RunWriter, is_finished, read_run
+from store.interrupt import Interrupted
 
 OBS, DIM = 3, 2
 LENGTHS = (5, 7)  # of every other episode; the shorter ones terminate, the longer ones are cut off
@@ -436,3 +439,23 @@ def test_an_algorithm_without_statistics_leaves_no_table(tmp_path):
     trainer = make_trainer(tmp_path)
     trainer.run()
     assert not (folder(trainer) / "training.csv").exists()
+
+
+def test_a_checkpoint_restores_every_counter_and_the_agent(tmp_path):
+    def stop():
+        if trainer.seeds[0].steps == 30:
+            raise Interrupted(15)
+
+    trainer = make_trainer(tmp_path)
+    trainer.stop_if_asked = stop
+    with pytest.raises(Interrupted):
+        trainer.run()
+    (checkpoint,), _ = CheckpointFolder(folder(trainer)).read()
+    again = make_trainer(tmp_path / "again")
+    again.restore([checkpoint])
+    before, after = trainer.seeds[0], again.seeds[0]
+    assert after.steps == 30 and again.agent.net.count.item() == 20 - 1
+    assert all(getattr(after, name) == getattr(before, name) for name in COUNTERS)
+    assert after.best.mean == before.best.mean and after.best.step == 20 and not after.ended
+    assert torch.equal(again.obs, trainer.obs) and torch.equal(again.center, trainer.center)
+    assert torch.equal(again.replay.rows[: again.replay.added[0]], trainer.replay.rows[: trainer.replay.added[0]])

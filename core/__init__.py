@@ -1,1 +1,1 @@
-"""What every algorithm shares: configuration, networks, replay, random streams, trainer, evaluation, run folder."""
+"""Learning, and nothing else: agents, maps, networks, replay, random streams, the training loop, evaluation."""

@@ -13,16 +13,21 @@ from matplotlib.figure import Figure
 from plots.paper import COLORS, FAMILIES
 
 FORMATS = ("png", "pdf")
+LATER = {"DGauge": ("#b5a100", "solid"), "SGauge": ("#ff6f61", "dashed")}
+"""Colours and lines of methods that are newer than the paper."""
 
 
 def color_of(algo: str) -> str:
-    # A name that the paper does not have gets a grey that depends on the name alone.
+    if algo in LATER:
+        return LATER[algo][0]
+    # An unknown name gets a grey that depends on the name alone.
     return COLORS.get(algo) or str(0.3 + 0.4 * (sum(algo.encode()) % 8) / 7)
 
 
 def line_of(algo: str, points: int) -> dict[str, Any]:
     """Keywords of a line through so many points."""
     line = "dashed" if algo in FAMILIES["SAC family"] else "solid" if algo in COLORS else "dashdot"
+    line = LATER[algo][1] if algo in LATER else line
     marker = "." if 0 < points < 20 else ""
     return {"color": color_of(algo), "linestyle": line, "linewidth": 1.5, "marker": marker}
 

@@ -32,7 +32,7 @@ from core.networks import MLP
 from core.words import ConfigError, parse_words, split_names, whole_number
 from envs import TASKS, TOLERANCE, InfeasibleActionError
 
-MAPS = ("project", "alpha_map", "radial_map")
+MAPS = ("project", "alpha_map", "radial_map", "gauge_map")
 NETWORK_STEPS = 25  # steps between new networks
 EXTREMES = [0.0, -0.0, 1e-45, -1e-45, 1e-38, 1e-20, -1e-8, 0.5, 1.0, -1.0, 1.0 + 1e-6, 3.0, -20.0, 1e5, 1e10, -1e30]
 EXTREMES += [1e30, 3e38, -3e38]
@@ -80,6 +80,12 @@ class Soak:
         beside = on_boundary * (1 + self.pick([0.0, 1e-7, -1e-7, 1e-6, 1e-3], n, 1))
         return torch.where(self.chance(0.1, n, 1) & beside.isfinite(), beside, suggested)
 
+    def mapped(self, name: str, obs: Tensor, suggested: Tensor) -> Tensor:
+        """What the map `name` makes of suggestions (n, d). Agents put those for the gauge map into the box first."""
+        if name == "gauge_map":
+            suggested = suggested.clamp(-1.0, 1.0)
+        return getattr(self.constraint, name)(obs, suggested)
+
     @torch.no_grad()
     def simulate(self, name: str, steps: int, progress: tqdm) -> None:
         """`steps` steps of the simulators in all, with the map `name`."""
@@ -93,7 +99,7 @@ class Soak:
             suggested = self.spoil(seen, actor(seen.unsqueeze(1)).squeeze(1))
             suggested[self.chance(0.01, self.parallel)] = self.pick(NOT_FINITE, 1)
             sound = suggested.isfinite().all(-1)
-            executed = getattr(self.constraint, name)(seen, torch.where(sound.unsqueeze(-1), suggested, 0.0)).numpy()
+            executed = self.mapped(name, seen, torch.where(sound.unsqueeze(-1), suggested, 0.0)).numpy()
             for i, env in enumerate(robots):
                 if not sound[i]:
                     self._expect_refusal(env, suggested[i].numpy())
@@ -128,7 +134,7 @@ class Soak:
             seen = obs.float()
             size = 10.0 ** (10 * torch.rand(n, 1, generator=self.generator) - 3)
             suggested = self.spoil(seen, size * self.normal(n, self.dim))
-            mapped = getattr(self.constraint, name)(seen, suggested)
+            mapped = self.mapped(name, seen, suggested)
             violation = self.constraint.violation(obs, mapped.double())
             self.checked += n
             self.largest[name] = max(self.largest[name], violation.max().item())

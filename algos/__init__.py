@@ -78,9 +78,9 @@ ALGORITHMS |= {
 def paper_settings(name: str, task: str, robot: Any, steps: int) -> Config:
     """The paper's configuration of the algorithm `name` on a task of `steps` environment steps.
 
-    `robot.hyperparameters` names its group in the paper's table; a robot without it is one of the "Others".
+    `robot.hyperparameters` names its group in the paper's table.
     """
-    return ALGORITHMS[name].paper_config(name, task, getattr(robot, "hyperparameters", "Others"), steps)
+    return ALGORITHMS[name].paper_config(name, task, robot.hyperparameters, steps)
 
 
 def setting_keys() -> dict[str, Field]:

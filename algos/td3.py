@@ -84,8 +84,7 @@ class TD3(Agent):
     @torch.no_grad()
     def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
         noise = self.config.action_noise * self.exploration.normal(self.action_dim, which=which)
-        suggested = self.suggest(self.actor, obs.unsqueeze(1)).squeeze(1) + noise
-        return suggested.clamp(-1.0, 1.0) if self.map.squashes else suggested
+        return self.suggest(self.actor, obs.unsqueeze(1)).squeeze(1) + noise
 
     def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:
         actor = rows_of(self.actor, which)

@@ -87,7 +87,7 @@ class Agent(Snapshots):
         options = {f.name: getattr(config, f.name) for f in fields(map) if hasattr(config, f.name)}
         self.map = replace(map, **options) if options else map
         self.placement = placement
-        self.stores_centers = self.map.stores_centers(constraint)
+        self.stores_centers = self.map.replays_center(constraint)
         self.penalty_weight = config.penalty if isinstance(config, PenaltyConfig) else None
         self.device = torch.device(config.device)  # of networks, batches and what `explore` and `policy` are given
         self.exploration = Streams(seeds, "explore", self.device)
@@ -104,7 +104,10 @@ class Agent(Snapshots):
 
     @abstractmethod
     def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
-        """Suggestions (seeds, d) with exploration noise, for obs (seeds, n). Only the rows `which` count."""
+        """Suggestions (seeds, d) with exploration noise, for obs (seeds, n). Only the rows `which` count.
+
+        Where the map squashes, `act` puts them back into the box.
+        """
 
     @abstractmethod
     def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:
@@ -138,7 +141,8 @@ class Agent(Snapshots):
         if warming_up:
             suggested[warming_up] = self.warm_up(warming_up)[warming_up].cpu()
         if exploring:
-            suggested[exploring] = self.explore(obs.to(self.device), exploring)[exploring].cpu()
+            explored = self.explore(obs.to(self.device), exploring)[exploring].cpu()
+            suggested[exploring] = explored.clamp(-1.0, 1.0) if self.map.squashes else explored
             executed = self.feasible(obs, suggested, center)
         if warming_up:
             pulled_back = self.map.pull_back(self.constraint, obs, suggested, center)

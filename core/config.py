@@ -12,10 +12,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import Any, NamedTuple
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from core.words import ConfigError
+
+THREADS = min(torch.get_num_threads(), 4)
+"""The threads of a cell that is alone on the machine: all physical cores (or OMP_NUM_THREADS), but no more than 4, as
+the networks are small."""
+
 
 # ---------------------------------------------------------------- how a setting is declared
 
@@ -92,13 +98,16 @@ class Config:
     # The run itself; none of these changes what is learned, beyond float rounding.
     results: str = setting("results", "folder that results go to")
     overwrite: bool = setting(False, "start again in any case; the old run is kept")
+    simulator: str | None = setting(
+        None, "Reacher: 'closed-form', or 'pybullet', its reference, where that is installed"
+    )
     device: str = setting(
         "cpu",
         "of networks and replay buffer: cpu, cuda or cuda:1",
         # Only the machine that trains can tell whether there is such a GPU.
         Rule(lambda value: bool(re.fullmatch(r"cpu|cuda(:[0-9]+)?", value)), "must be cpu, cuda or cuda:N"),
     )
-    threads: int = setting(1, "CPU threads of PyTorch", AT_LEAST_ONE)
+    threads: int = setting(THREADS, "CPU threads (default: a cell alone up to 4, in a sweep 1)", AT_LEAST_ONE)
     checkpoint_every: int = setting(10_000, "environment steps of a seed between checkpoints", AT_LEAST_ONE)
 
 
@@ -109,8 +118,13 @@ class PenaltyConfig(Config):
     penalty: float = setting(1.0, "names with +: weight of the penalty", NOT_NEGATIVE)
 
 
-RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "device", "threads", "checkpoint_every")
+RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "simulator", "device", "threads", "checkpoint_every")
 """Settings that do not make a run another experiment: they never show in a run's name."""
+
+
+def keys_that_apply(config: Config) -> list[str]:
+    """The keys that a user can set for the cell of `config`. Where there is no choice, the value is None."""
+    return [key for key, f in keys_of(config).items() if getattr(config, f.name) is not None]
 
 
 # ---------------------------------------------------------------- values on the command line
@@ -174,16 +188,16 @@ def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
     for key, text in overrides.items():
         if key in ("algo", "env"):
             continue
-        if key not in keys_of(schema):
-            raise ConfigError(f"{key} does not apply to {base.algo}")
+        if key not in keys_that_apply(base):
+            raise ConfigError(f"{key} does not apply to {base.algo} on {base.env}")
         override(config, schema, key, text)
     resolved = typing.cast(Config, OmegaConf.to_object(config))
     resolved.seeds = tuple(resolved.seeds)  # OmegaConf makes a list of it
-    check_ranges(resolved)
+    _check_ranges(resolved)
     return resolved
 
 
-def check_ranges(config: Config) -> None:
+def _check_ranges(config: Config) -> None:
     """ConfigError for a number that is not finite or a value that breaks the rule of its field."""
     for key, f in keys_of(config).items():
         value, rule = getattr(config, f.name), f.metadata.get("rule")

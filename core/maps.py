@@ -67,7 +67,7 @@ class Map(ABC):
         """Put a target action (..., d), to which TD3 has added noise, back where the critic knows actions."""
         return self.pull_back(constraint, obs, action, center)
 
-    def stores_centers(self, constraint: Constraint) -> bool:
+    def replays_center(self, constraint: Constraint) -> bool:
         """Whether the replay buffer has two centres a transition. The origin needs no storing."""
         return self.needs_center and not constraint.origin_centered
 

@@ -12,16 +12,12 @@ from typing import Any
 from torch import Tensor
 
 from core.agent import Agent
-from core.config import ConfigError
 from core.evaluation import Evaluator
 from core.progress import PhaseTimer
 from core.replay import Replay
 from core.seed import Seed
 from store.checkpoint import Checkpoint
 from store.files import one_line
-
-STATE_FORMAT = 2
-"""Version of what a checkpoint's state holds. A checkpoint of another version is refused."""
 
 
 class Moments:
@@ -51,19 +47,9 @@ class Moments:
                     seed.checkpoints.discard()
 
     def restore(self, checkpoints: Sequence[Checkpoint], obs: Tensor, center: Tensor | None) -> None:
-        """Go back to the moment of `checkpoints`, one of each seed; obs and `center` receive those of that moment.
-
-        ConfigError for a checkpoint that another version of this program has written.
-        """
-        states = [checkpoint.state() for checkpoint in checkpoints]
-        for checkpoint, state in zip(checkpoints, states, strict=True):
-            if state.get("format") != STATE_FORMAT:
-                raise ConfigError(
-                    f"{checkpoint.path} was written by another version of this program, which alone can resume it;"
-                    " overwrite=true starts again and keeps the old run"
-                )
-        for seed, checkpoint, state in zip(self.seeds, checkpoints, states, strict=True):
-            i = seed.position
+        """Go back to the moment of `checkpoints`, one of each seed; obs and `center` receive those of that moment."""
+        for seed, checkpoint in zip(self.seeds, checkpoints, strict=True):
+            i, state = seed.position, checkpoint.state()
             seed.restore(state)
             obs[i] = state["obs"]
             if center is not None:
@@ -74,13 +60,12 @@ class Moments:
             self.replay.streams.generators[i].set_state(state["sampling"])
             checkpoint.fill(*self._stored(seed))
             seed.checkpoints.resume(checkpoint)
-        self.timer.restore(states[-1]["seconds"])
+        self.timer.restore(state["seconds"])
 
     def _state(self, seed: Seed, obs: Tensor, center: Tensor | None) -> dict[str, Any]:
         """Everything about a seed but its transitions."""
         i = seed.position
         return seed.state() | {
-            "format": STATE_FORMAT,
             "obs": obs[i].clone(),
             "center": None if center is None else center[i].clone(),
             "agent": self.agent.training_state(i),

@@ -6,7 +6,9 @@ written "-".
 
 import gymnasium
 
+from constraints import Constraint
 from envs.constrained import TOLERANCE, ActionConstrainedEnv, InfeasibleActionError, find_task, step_together
+from envs.robot import Robot, UnavailableError
 from envs.tasks import TASKS, Task
 
 __all__ = [
@@ -14,23 +16,35 @@ __all__ = [
     "TOLERANCE",
     "ActionConstrainedEnv",
     "InfeasibleActionError",
+    "Robot",
     "Task",
+    "UnavailableError",
     "constraint",
     "make",
     "step_together",
 ]
 
 
-def make(task, project=False, render_mode=None):
+def make(
+    task: str,
+    project: bool = False,
+    render_mode: str | None = None,
+    simulator: str | None = None,
+    show_set: bool = False,
+) -> ActionConstrainedEnv:
     """The environment of `task` (a key of `TASKS`, as "W+M"); see `ActionConstrainedEnv`.
 
     An infeasible action is refused with `InfeasibleActionError`; with `project` it is projected instead, so
-    that any agent for Gymnasium trains on it as the paper's DPre does. ValueError for an unknown task.
+    that any agent for Gymnasium trains on it as the paper's DPre does. `simulator="pybullet"` runs Reacher on PyBullet,
+    where that is installed. `show_set` draws the feasible set of a two-dimensional action into pictures.
+
+    Raises ValueError for an unknown task, and UnavailableError, a ValueError too, for a simulator that the robot does
+    not have or that is not installed.
     """
-    return ActionConstrainedEnv(task, project, render_mode)
+    return ActionConstrainedEnv(task, project, render_mode, simulator, show_set)
 
 
-def constraint(task):
+def constraint(task: str) -> Constraint:
     """The `constraints.Constraint` of `task` (a key of `TASKS`); ValueError for an unknown task."""
     return find_task(task).constraint
 

@@ -1,32 +1,60 @@
 """The Gymnasium environment of a task: a robot that executes feasible actions only."""
 
+from __future__ import annotations
+
+import importlib
 import json
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 
 from core.words import known_name
-from envs.tasks import TASKS
+from envs.drawing import draw_set
+from envs.robot import Robot, Step, UnavailableError
+from envs.tasks import TASKS, Task
 
 TOLERANCE = 1e-6  # largest violation an executed action may have, in the units of `Constraint.violation`
+
+Outcome = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
+"""What `step` of an environment returns: observation (n,), reward, terminated, truncated, info."""
 
 
 class InfeasibleActionError(ValueError):
     """An action lies outside the task's feasible set at the current observation, or is no action at all."""
 
 
-def find_task(name):
+def find_task(name: str) -> Task:
     """The `Task` called `name`; ValueError with the choices and the closest name where there is none."""
     return TASKS[known_name("task", name, TASKS)]
 
 
-def step_together(envs, actions):
+def make_robot(task: str, simulator: str | None = None) -> Robot:
+    """A new robot of `task` on `simulator`, a key of the robot's `simulators`; None means the first.
+
+    Raises UnavailableError for a simulator that the robot does not have or that is not installed.
+    """
+    robot = find_task(task).robot
+    if simulator is None:
+        return robot()
+    if simulator not in robot.simulators:
+        choices = (
+            f"choices: {' '.join(robot.simulators)}" if robot.simulators else "its robot has no choice of simulators"
+        )
+        raise UnavailableError(f"unknown simulator {simulator!r} for {task} ({choices})")
+    module, _, name = robot.simulators[simulator].partition(":")
+    return getattr(importlib.import_module(module), name)()
+
+
+def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.ndarray] | np.ndarray) -> list[Any]:
     """Step each `ActionConstrainedEnv` of `envs` with its action (d,) of `actions`, all under one violation check.
 
     Returns a list: what `step` returns or, for an action that it refuses, the InfeasibleActionError that it raises;
-    the others are executed all the same. Each environment does what it would do alone.
+    the others are executed all the same. Each environment does what it would do alone, in every bit. Robots of one
+    class take the step in one call.
 
     Raises gymnasium.error.ResetNeeded where an environment needs a reset, and ValueError for environments of different
     constraints and for one given twice, whose second action would be checked at a past observation. None has then been
@@ -34,14 +62,22 @@ def step_together(envs, actions):
     """
     if len(set(map(id, envs))) < len(envs) or any(env.constraint is not envs[0].constraint for env in envs):
         raise ValueError("step_together() takes different environments of one constraint")
-    outcomes = [env._well_formed(action) for env, action in zip(envs, actions, strict=True)]
+    outcomes: list[Any] = [env._well_formed(action) for env, action in zip(envs, actions, strict=True)]
     checked = [k for k, outcome in enumerate(outcomes) if not isinstance(outcome, InfeasibleActionError)]
-    if checked:
-        obs = torch.from_numpy(np.array([envs[k]._obs for k in checked]))
-        exact = torch.from_numpy(np.array([outcomes[k] for k in checked], np.float64))
-        violations = envs[0].constraint.violation(obs, exact).tolist()
-        for k, violation in zip(checked, violations, strict=True):
-            outcomes[k] = envs[k]._execute(outcomes[k], violation)
+    if not checked:
+        return outcomes
+    obs = torch.from_numpy(np.array([envs[k]._obs for k in checked]))
+    exact = torch.from_numpy(np.array([outcomes[k] for k in checked], np.float64))
+    violations = envs[0].constraint.violation(obs, exact).tolist()
+    by_robot: dict[type[Robot], list[int]] = {}
+    for k, violation in zip(checked, violations, strict=True):
+        outcomes[k] = envs[k]._admit(outcomes[k], violation)
+        if not isinstance(outcomes[k], InfeasibleActionError):
+            by_robot.setdefault(type(envs[k].robot), []).append(k)
+    for robot_class, admitted in by_robot.items():
+        steps = robot_class.step_together([envs[k].robot for k in admitted], [outcomes[k] for k in admitted])
+        for k, step in zip(admitted, steps, strict=True):
+            outcomes[k] = envs[k]._record(outcomes[k], step)
     return outcomes
 
 
@@ -52,6 +88,8 @@ class ActionConstrainedEnv(gymnasium.Env):
     observation is computed in float64 before it is executed, and above 1e-6 the action is refused. With
     `project`, an action outside the set is replaced by its projection instead, and
     `info["executed_action"]` holds what was executed (float64, (d,)). The robot's time limit truncates.
+    `simulator` chooses among the robot's simulators. With `show_set`, pictures show the
+    last action of a two-dimensional action space in the set that was feasible for it.
 
     Attributes: `constraint`; `largest_violation` (float) over all executed actions since construction, -inf
     before the first; `executed_actions` (int), their number; `elapsed_steps` (int) of the current episode.
@@ -59,33 +97,46 @@ class ActionConstrainedEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"]}
 
-    def __init__(self, task, project=False, render_mode=None):
-        found = find_task(task)
+    def __init__(
+        self,
+        task: str,
+        project: bool = False,
+        render_mode: str | None = None,
+        simulator: str | None = None,
+        show_set: bool = False,
+    ):
+        self.constraint = find_task(task).constraint
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r} (choices: None 'rgb_array')")
-        self.task, self.constraint, self.project, self.render_mode = (
-            task,
-            found.constraint,
-            project,
-            render_mode,
-        )
-        self.robot = found.robot()
+        if show_set and self.constraint.dim != 2:
+            raise ValueError(
+                f"show_set=True needs a two-dimensional action; {task} has {self.constraint.dim} dimensions"
+            )
+        self.task, self.project, self.render_mode, self.show_set = task, project, render_mode, show_set
+        self.robot = make_robot(task, simulator)
         self.metadata = {**self.metadata, "render_fps": self.robot.fps}
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.robot.obs_dim,), np.float64)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.robot.action_dim,), np.float32)
         self.largest_violation, self.executed_actions, self.elapsed_steps = -np.inf, 0, 0
-        self._obs = None  # current observation in an array of its own: callers may write into theirs
-        self._start, self._actions = None, None  # of the episode: state of the random numbers before it; its actions
+        self._obs: np.ndarray | None = None  # current observation in an array of its own: callers may write into theirs
+        # Of the episode: the state of the random numbers before its reset, and its actions so far. Actions are kept
+        # only where the robot has no state of its own.
+        self._start: Mapping[str, Any] | None = None
+        self._actions: list[np.ndarray] = []
+        self._keeps_actions = False
+        self._shown: tuple[np.ndarray, np.ndarray] | None = None  # the last action and the observation it belongs to
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Start an episode; return observation (n,) and info. `seed` as Gymnasium defines it."""
         super().reset(seed=seed)
         self._start, self._actions, self.elapsed_steps = self.np_random.bit_generator.state, [], 0
+        self._shown = None
         obs = self.robot.reset(self.np_random)
+        self._keeps_actions = self.robot.get_state() is None
         self._obs = obs.copy()
         return obs, {}
 
-    def step(self, action):
+    def step(self, action: np.ndarray) -> Outcome:
         """Execute `action` (d,); return observation, reward, terminated, truncated, info.
 
         Raises InfeasibleActionError for a wrong shape, a value that is not finite or, without `project`, a
@@ -96,48 +147,72 @@ class ActionConstrainedEnv(gymnasium.Env):
             raise outcome
         return outcome
 
-    def get_state(self):
-        """Everything that `set_state`, also in another process, needs to go on bit for bit: a dict of numbers, text,
-        lists and one tensor.
+    def get_state(self) -> dict[str, Any]:
+        """Everything that `set_state`, also in another process, needs to continue bit for bit: a dict of numbers, text
+        and tensors.
 
-        It holds the actions of the episode and the state of the random numbers at its start, not the simulator's
-        memory: simulators do not save all of that bit for bit (PyBullet), while the same actions after the same reset
-        repeat the episode exactly. Of an episode that is over only the random numbers are left.
+        An episode in progress is kept as the robot's own state. For a robot that has none, it is kept as the random
+        numbers before its reset and the actions since. Of an episode that is over only the random numbers are left.
         """
-        random_numbers = self._start or self.np_random.bit_generator.state
+        in_episode = self._start is not None
+        robot = self.robot.get_state() if in_episode else None
+        random_numbers = self.np_random.bit_generator.state if robot is not None else self._start
         return {
-            "random_numbers": json.dumps(random_numbers),
-            "in_episode": self._start is not None,
+            "random_numbers": json.dumps(random_numbers or self.np_random.bit_generator.state),
+            "in_episode": in_episode,
+            "simulator": type(self.robot).__name__,
+            "robot": None if robot is None else torch.from_numpy(robot),
             "actions": torch.from_numpy(np.array(self._actions)) if self._actions else None,
+            "elapsed_steps": self.elapsed_steps,
             "executed_actions": self.executed_actions,
             "largest_violation": self.largest_violation,
         }
 
-    def set_state(self, state):
+    def set_state(self, state: Mapping[str, Any]) -> None:
         """Go back to what `get_state` described; after an episode that was over, the next call must be a reset.
 
-        An episode in progress is repeated from its start: at most 1,000 simulation steps.
+        A robot without a state of its own repeats an episode in progress. Raises ValueError for the state of another
+        robot or simulator.
         """
+        if state.get("simulator") != type(self.robot).__name__:
+            raise ValueError(f"the state of {state.get('simulator')} does not fit {type(self.robot).__name__}")
         self.np_random.bit_generator.state = json.loads(state["random_numbers"])
-        self._start, self._actions, self._obs = None, None, None
-        if state["in_episode"]:
+        self._start, self._actions, self._obs, self._shown = None, [], None, None
+        if state["robot"] is not None:
+            self._start, self._keeps_actions = self.np_random.bit_generator.state, False
+            self._obs = self.robot.set_state(state["robot"].numpy())
+        elif state["in_episode"]:
             self.reset()
             for action in () if state["actions"] is None else state["actions"].numpy():
                 self._obs = self.robot.step(action)[0]
                 self._actions.append(action)
-            self.elapsed_steps = len(self._actions)
+        self.elapsed_steps = state["elapsed_steps"]
         self.executed_actions, self.largest_violation = state["executed_actions"], state["largest_violation"]
 
-    def render(self):
+    def render(self) -> np.ndarray | None:
         """Picture (480, 480, 3), uint8, of the current state; None without `render_mode="rgb_array"`."""
-        return self.robot.render() if self.render_mode == "rgb_array" else None
+        if self.render_mode != "rgb_array":
+            return None
+        picture = self.robot.render()
+        if self.show_set and self._obs is not None:
+            obs, action = self._shown or (self._obs, None)
+            picture = draw_set(picture, self._boundary(obs), action)
+        return picture
 
-    def close(self):
+    def close(self) -> None:
         """Free simulator and renderer; closing twice is harmless."""
         self.robot.close()
         self._obs = None
 
-    def _well_formed(self, action):
+    def _boundary(self, obs: np.ndarray) -> np.ndarray:
+        """Points (k, 2) around the feasible set at `obs`, in order."""
+        angle = torch.linspace(0, 2 * math.pi, 361, dtype=torch.float64)[:-1]
+        direction = torch.stack((angle.cos(), angle.sin()), -1)
+        repeated = torch.from_numpy(obs).expand(len(angle), -1)
+        center = self.constraint.center(repeated)
+        return (center + direction / self.constraint.gauge(repeated, direction, center).unsqueeze(-1)).numpy()
+
+    def _well_formed(self, action: np.ndarray) -> np.ndarray | InfeasibleActionError:
         """`action` as an array (d,) of finite numbers, or the InfeasibleActionError that says why it is none."""
         if self._obs is None:
             raise gymnasium.error.ResetNeeded(f"{self.task}: call reset() before step()")
@@ -149,11 +224,11 @@ class ActionConstrainedEnv(gymnasium.Env):
             return InfeasibleActionError(f"{self._where()}: action {action} is not finite")
         return action
 
-    def _execute(self, action, violation):
-        """What `step` returns for a well-formed `action`, or the InfeasibleActionError that refuses it.
+    def _admit(self, action: np.ndarray, violation: float) -> np.ndarray | InfeasibleActionError:
+        """What the robot executes for a well-formed `action`, or the InfeasibleActionError that refuses it.
 
-        Executed is `action` itself (in its own precision) or its projection; `violation` (float) is that of `action` at
-        the current observation.
+        That is `action` itself (in its own precision) or its projection; `violation` is that of `action` at the current
+        observation.
         """
         if self.project and violation > 0:
             obs, exact = torch.from_numpy(self._obs), torch.from_numpy(action.astype(np.float64))
@@ -165,11 +240,18 @@ class ActionConstrainedEnv(gymnasium.Env):
                 f"(at most {TOLERANCE:g} is allowed)"
             )
         self.largest_violation = max(self.largest_violation, violation)
-        obs, reward, terminated, info = self.robot.step(action)
+        return action
+
+    def _record(self, action: np.ndarray, step: Step) -> Outcome:
+        """Count the step that the robot took with `action`, and return what the environment's `step` returns."""
+        obs, reward, terminated, info = step
+        if self.show_set:
+            self._shown = self._obs, np.array(action)
         self._obs = obs.copy()
-        self._actions.append(np.array(action))
         self.executed_actions += 1
         self.elapsed_steps += 1
+        if self._keeps_actions:
+            self._actions.append(np.array(action))
         if self.project:
             info["executed_action"] = np.array(action, np.float64)
         truncated = self.elapsed_steps >= self.robot.max_episode_steps
@@ -177,5 +259,5 @@ class ActionConstrainedEnv(gymnasium.Env):
             self._start, self._actions = None, []
         return obs, reward, terminated, truncated, info
 
-    def _where(self):
+    def _where(self) -> str:
         return f"{self.task}, step {self.elapsed_steps + 1} of the episode"

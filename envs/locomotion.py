@@ -1,17 +1,23 @@
 """HalfCheetah, Hopper and Walker2d on MuJoCo: step for step Gymnasium's `-v4` tasks (the v3 rewards)."""
 
+from __future__ import annotations
+
 import ctypes.util
 import functools
 import importlib
 import os
 import sys
+from abc import abstractmethod
+from typing import Any
 
 import gymnasium
 import numpy as np
 
+from envs.robot import Robot, Step
+
 
 @functools.cache
-def _load_model(file):
+def _load_model(file: str) -> Any:
     """The MuJoCo model of `file`, which robots share: half a megabyte each would crowd the processor's cache."""
     import mujoco
 
@@ -26,7 +32,7 @@ def _load_model(file):
         mujoco.set_mju_user_warning(warning_handler)
 
 
-class _Locomotion:
+class _Locomotion(Robot):
     """A planar robot that is rewarded for running along x.
 
     Observation (nq - 1 + nv,): joint positions without the root's x, then joint velocities.
@@ -37,13 +43,11 @@ class _Locomotion:
     # filled by each robot
     model_file: str
     frame_skip: int
-    obs_dim: int
-    action_dim: int
     ctrl_cost_weight: float
     healthy_reward: float
     fps: int  # 1 / (time step of the model * frame_skip)
 
-    def __init__(self):
+    def __init__(self) -> None:
         import mujoco
 
         self._mujoco = mujoco
@@ -52,16 +56,16 @@ class _Locomotion:
         # views of the simulator's memory
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._dt = self.model.opt.timestep * self.frame_skip
-        self._picture = None
+        self._picture: _Picture | None = None
 
-    def reset(self, rng):
+    def reset(self, rng: np.random.Generator) -> np.ndarray:
         """Draw positions and velocities around the model's own from `rng` (numpy Generator); return obs."""
         self._mujoco.mj_resetData(self.model, self.data)
         self._perturb(rng)
         self._mujoco.mj_forward(self.model, self.data)
         return self._observe()
 
-    def step(self, action):
+    def step(self, action: np.ndarray) -> Step:
         """Apply `action` (nu,) for `frame_skip` time steps; return observation, reward, terminated, info.
 
         The control cost is summed in the action's own precision, as Gymnasium does.
@@ -75,7 +79,23 @@ class _Locomotion:
         reward = x_velocity + self.healthy_reward - ctrl_cost
         return self._observe(), reward, not self._healthy(), {"x_position": x, "x_velocity": x_velocity}
 
-    def render(self, width=480, height=480):
+    def get_state(self) -> np.ndarray:
+        """Everything that MuJoCo's next step depends on (k,), the solver's warm start included."""
+        state = np.empty(self._mujoco.mj_stateSize(self.model, self._mujoco.mjtState.mjSTATE_INTEGRATION))
+        self._mujoco.mj_getState(self.model, self.data, state, self._mujoco.mjtState.mjSTATE_INTEGRATION)
+        return state
+
+    def set_state(self, state: np.ndarray) -> np.ndarray:
+        """Take up `state` (k,) from `get_state`; return the observation."""
+        self._mujoco.mj_resetData(self.model, self.data)
+        self._mujoco.mj_setState(self.model, self.data, state, self._mujoco.mjtState.mjSTATE_INTEGRATION)
+        # Positions of the bodies, for a picture; the next step computes everything else.
+        self._mujoco.mj_kinematics(self.model, self.data)
+        self._mujoco.mj_comPos(self.model, self.data)
+        self._mujoco.mj_camlight(self.model, self.data)
+        return self._observe()
+
+    def render(self, width: int = 480, height: int = 480) -> np.ndarray:
         """Picture (height, width, 3), uint8, from the side, the camera following the robot.
 
         Raises RuntimeError where no OpenGL backend works.
@@ -84,11 +104,22 @@ class _Locomotion:
             self._picture = _Picture(self._mujoco, self.model, width, height)
         return self._picture.take(self.data)
 
-    def close(self):
+    def close(self) -> None:
         """Free the renderer; closing twice is harmless."""
         if self._picture is not None:
             self._picture.close()
             self._picture = None
+
+    @abstractmethod
+    def _perturb(self, rng: np.random.Generator) -> None:
+        """Draw the start of an episode around the model's own positions and velocities."""
+
+    @abstractmethod
+    def _observe(self) -> np.ndarray: ...
+
+    @abstractmethod
+    def _healthy(self) -> bool:
+        """Whether the robot has not fallen."""
 
 
 class HalfCheetah(_Locomotion):
@@ -98,14 +129,14 @@ class HalfCheetah(_Locomotion):
     ctrl_cost_weight, healthy_reward = 0.1, 0.0
     fps = 20
 
-    def _perturb(self, rng):
+    def _perturb(self, rng: np.random.Generator) -> None:
         self._qpos += rng.uniform(-0.1, 0.1, self.model.nq)
         self._qvel += 0.1 * rng.standard_normal(self.model.nv)
 
-    def _observe(self):
+    def _observe(self) -> np.ndarray:
         return np.concatenate((self._qpos[1:], self._qvel))
 
-    def _healthy(self):
+    def _healthy(self) -> bool:
         return True
 
 
@@ -118,11 +149,11 @@ class _Upright(_Locomotion):
     frame_skip, ctrl_cost_weight, healthy_reward = 4, 1e-3, 1.0
     fps = 125
 
-    def _perturb(self, rng):
+    def _perturb(self, rng: np.random.Generator) -> None:
         self._qpos += rng.uniform(-5e-3, 5e-3, self.model.nq)
         self._qvel += rng.uniform(-5e-3, 5e-3, self.model.nv)
 
-    def _observe(self):
+    def _observe(self) -> np.ndarray:
         return np.concatenate((self._qpos[1:], self._qvel.clip(-10.0, 10.0)))
 
 
@@ -132,7 +163,7 @@ class Hopper(_Upright):
     hyperparameters = "Hopper"  # its group in the paper's table
     model_file, obs_dim, action_dim = "hopper.xml", 11, 3
 
-    def _healthy(self):
+    def _healthy(self) -> bool:
         z, angle = self._qpos[1:3].tolist()
         state = self._qpos[2:].tolist() + self._qvel.tolist()
         return z > 0.7 and abs(angle) < 0.2 and all(-100.0 < s < 100.0 for s in state)
@@ -143,12 +174,12 @@ class Walker2d(_Upright):
 
     model_file, obs_dim, action_dim = "walker2d.xml", 17, 6
 
-    def _healthy(self):
+    def _healthy(self) -> bool:
         z, angle = self._qpos[1:3].tolist()
         return 0.8 < z < 2.0 and -1.0 < angle < 1.0
 
 
-def _gl_backend():
+def _gl_backend() -> str:
     """Name of the OpenGL backend to use: MUJOCO_GL if set, otherwise one that fits this machine.
 
     Chosen once and before anything is loaded: PyOpenGL cannot change its platform afterwards. It is chosen
@@ -174,7 +205,7 @@ def _gl_backend():
 class _Picture:
     """An off-screen OpenGL context with a camera that follows the robot's torso."""
 
-    def __init__(self, mujoco, model, width, height):
+    def __init__(self, mujoco: Any, model: Any, width: int, height: int):
         backend = _gl_backend()
         try:
             self._gl = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
@@ -194,7 +225,7 @@ class _Picture:
         self._camera.trackbodyid = model.body("torso").id
         self._camera.distance, self._camera.azimuth, self._camera.elevation = 4.0, 90.0, -15.0
 
-    def take(self, data):
+    def take(self, data: Any) -> np.ndarray:
         self._gl.make_current()
         self._mujoco.mjv_updateScene(
             self._model, data, self._option, None, self._camera, self._mujoco.mjtCatBit.mjCAT_ALL, self._scene
@@ -204,7 +235,7 @@ class _Picture:
         self._mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)
         return pixels[::-1].copy()  # OpenGL counts rows from below
 
-    def close(self):
+    def close(self) -> None:
         self._gl.make_current()
         self._context.free()
         self._gl.free()

@@ -5,9 +5,12 @@ reports them: Hopper and Walker2d clip velocities to +-10, Reacher's velocities 
 theta_2 is the joint angle divided by 3.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from constraints import (
     Ball,
@@ -21,6 +24,7 @@ from constraints import (
 )
 from envs.locomotion import HalfCheetah, Hopper, Walker2d
 from envs.reacher import Reacher
+from envs.robot import Robot
 
 
 @dataclass(frozen=True)
@@ -28,40 +32,40 @@ class Task:
     """`robot`: its simulation; `constraint`: the feasible set, the action box included; `description` in
     words and `formula` in LaTeX: that set without the box; `steps`: environment steps of a training run."""
 
-    robot: type
+    robot: type[Robot]
     constraint: Constraint
     description: str
     formula: str
     steps: int
 
 
-def _reacher_velocities(obs):
+def _reacher_velocities(obs: Tensor) -> Tensor:
     return obs[..., 6:9:2]
 
 
-def _hopper_velocities(obs):
+def _hopper_velocities(obs: Tensor) -> Tensor:
     return obs[..., 8:11]
 
 
-def _six_joint_velocities(obs):  # HalfCheetah and Walker2d have the same layout
+def _six_joint_velocities(obs: Tensor) -> Tensor:  # HalfCheetah and Walker2d have the same layout
     return obs[..., 11:17]
 
 
-def _hopper_sin2(obs):
+def _hopper_sin2(obs: Tensor) -> Tensor:
     return torch.sin(obs[..., 2:5]).square()
 
 
-def _six_joint_sin2(obs):
+def _six_joint_sin2(obs: Tensor) -> Tensor:
     return torch.sin(obs[..., 2:8]).square()
 
 
-def _tip_matrix(obs):
+def _tip_matrix(obs: Tensor) -> Tensor:
     """Q (..., 2, 2) with a'Qa = a1^2 + 2 a1 (a1 + a2) cos(theta_2) + (a1 + a2)^2."""
     c = torch.cos(obs[..., 7])
     return torch.stack((2 + 2 * c, 1 + c, 1 + c, torch.ones_like(c)), -1).unflatten(-1, (2, 2))
 
 
-def _leg_normal(obs):
+def _leg_normal(obs: Tensor) -> Tensor:
     """Normal (..., 6) of HC+MA: thigh velocity times sine of its leg's summed angles, back and front."""
     sines = torch.sin(obs[..., 2:8].unflatten(-1, (2, 3)).sum(-1))
     normal = torch.zeros_like(obs[..., :6])

@@ -31,7 +31,14 @@ from store.files import one_line, replace_file
 Stretch = Callable[[int, int], Sequence[torch.Tensor]]
 """Maps `start` and `stop` to views of one seed's transitions `start` to `stop` - 1, a row of float32 each."""
 
+FORMAT = 2
+"""Counts the changes of what a checkpoint holds."""
+
 _DAMAGES = (OSError, ValueError, KeyError, TypeError, RuntimeError, pickle.UnpicklingError)
+
+
+class FormatError(Exception):
+    """A checkpoint is intact, but of another version of this code. The message is one line."""
 
 
 class ReplayFile(NamedTuple):
@@ -108,7 +115,7 @@ class CheckpointFolder:
         """
         self.folder.mkdir(exist_ok=True)
         files = self._write_replay(stretch, oldest, stop)
-        content = {"serial": self.serial + 1, "moment": moment, "group": list(group), "step": step}
+        content = {"format": FORMAT, "serial": self.serial + 1, "moment": moment, "group": list(group), "step": step}
         content |= {"settings": dict(settings), "replay_files": [list(file) for file in files]}
         body = io.BytesIO()
         torch.save(content | {"state": dict(state)}, body)
@@ -148,12 +155,20 @@ class CheckpointFolder:
         return self.folder / f"state-{serial}.pt"
 
     def read(self) -> tuple[list[Checkpoint], list[str]]:
-        """The intact checkpoints, newest first, and a line for each damaged one."""
+        """The intact checkpoints, newest first, and a line for each damaged one.
+
+        Raises FormatError if another version of this code wrote one.
+        """
         intact, problems = [], []
         digests: dict[str, str] = {}  # of replay files, most of which both checkpoints name
         for path in sorted(self.folder.glob("state-*.pt"), key=_serial_of, reverse=True):
             try:
                 content = _load(path)
+                if content.get("format") != FORMAT:
+                    raise FormatError(
+                        f"{path} was written by another version of this code, and this one cannot resume from it;"
+                        " overwrite=true starts the run again and keeps the old one"
+                    )
                 files = tuple(ReplayFile(*file) for file in content["replay_files"])
                 for file in files:
                     if file.name not in digests:

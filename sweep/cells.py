@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from algos import ALGORITHMS, PAPER, paper_settings, setting_keys
-from core.config import Config, differences, keys_of, resolve
+from core.config import Config, differences, keys_that_apply, resolve
 from core.words import ConfigError, parse_words, split_names
 from envs import TASKS
 from store.files import replace_file
@@ -114,12 +114,16 @@ class Cell(CellFolders):
         words |= {"results": str(self.root.absolute()), "overwrite": json.dumps(config.overwrite)}
         words |= {"device": config.device, "threads": str(config.threads)}
         words["checkpoint_every"] = str(config.checkpoint_every)
+        if config.simulator is not None:
+            words["simulator"] = config.simulator
         return [f"{key}={value}" for key, value in words.items()]
 
 
 def paper_config(name: str, task: str) -> Config:
     """The paper's configuration of the algorithm `name` on `task`."""
-    return paper_settings(name, task, TASKS[task].robot, TASKS[task].steps)
+    robot = TASKS[task].robot
+    simulator = next(iter(robot.simulators), None)
+    return replace(paper_settings(name, task, robot, TASKS[task].steps), simulator=simulator)
 
 
 def make_cells(settings: Mapping[str, str]) -> list[Cell]:
@@ -137,7 +141,7 @@ def make_cells(settings: Mapping[str, str]) -> list[Cell]:
 
     def applies(key: str, paper: Config) -> bool:
         # A key that no algorithm has is a mistake, which `resolve` reports.
-        return key in keys_of(paper) or not any(key in keys_of(other) for other in papers)
+        return key in keys_that_apply(paper) or not any(key in keys_that_apply(other) for other in papers)
 
     return [
         Cell.of(resolve(paper, {key: text for key, text in settings.items() if applies(key, paper)}))

@@ -34,7 +34,6 @@ STEP_OVERHEAD = 2.0
 # Memory: the peaks of short runs with one seed and with ten.
 PROCESS_BYTES = 380e6  # libraries
 SEED_BYTES = 15e6  # networks and optimisers of one seed
-SIMULATOR_BYTES = {"Reacher": 35e6}  # PyBullet's; MuJoCo's are too small to matter
 
 TELLING_STEPS = 10_000
 """The fewest gradient steps of a run whose time corrects the estimates."""
@@ -86,10 +85,9 @@ def seconds(config: Config, paper: Config, seeds: int, start: int = 0) -> float:
 def memory(config: Config, seeds: int) -> float:
     """Bytes, with the replay buffer as full as it gets."""
     robot = _robot(config)
-    centers = 2 if ALGORITHMS[config.algo].map.stores_centers(TASKS[config.env].constraint) else 0
+    centers = 2 if ALGORITHMS[config.algo].map.replays_center(TASKS[config.env].constraint) else 0
     width = 2 * robot.obs_dim + (1 + centers) * robot.action_dim + 2
-    simulators = (1 + config.eval_episodes) * SIMULATOR_BYTES.get(robot.__name__, 0.0)
-    return PROCESS_BYTES + seeds * (SEED_BYTES + simulators + 4.0 * width * min(config.buffer_size, config.steps))
+    return PROCESS_BYTES + seeds * (SEED_BYTES + 4.0 * width * min(config.buffer_size, config.steps))
 
 
 def _robot(config: Config) -> Any:

@@ -9,6 +9,7 @@ from enum import IntEnum
 
 from constraints import ConstraintError
 from core.words import ConfigError
+from store.checkpoint import FormatError
 from store.files import one_line
 from store.interrupt import Interrupted, Interrupts
 from store.lock import LockedError
@@ -31,7 +32,7 @@ def exit_code(command: Callable[[Callable[[], None]], int]) -> int:
     try:
         with Interrupts() as interrupts:
             return command(interrupts.stop_if_asked)
-    except (ConfigError, ConstraintError, LockedError) as error:
+    except (ConfigError, ConstraintError, FormatError, LockedError) as error:
         print(f"run.py: {one_line(error)}", file=sys.stderr)
         return Exit.BAD_INPUT
     except OSError as error:

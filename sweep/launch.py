@@ -9,7 +9,7 @@ from dataclasses import replace
 from core.words import ConfigError
 from sweep.cells import Cell
 from sweep.exit import Exit
-from sweep.local import cores, run_queue
+from sweep.local import run_queue
 from sweep.plan import describe_plan, make_plan, memory_warning
 from sweep.settings import Sweep
 from sweep.slurm import check_gpus, submit
@@ -26,7 +26,7 @@ def launch(sweep: Sweep, cells: Sequence[Cell], threads_given: bool, stop_if_ask
     on_slurm = sweep.settings.launcher == "slurm"
     jobs = sweep.slurm.parallel if on_slurm else sweep.settings.jobs or 1
     if not threads_given:
-        threads = sweep.slurm.cpus if on_slurm else max(1, cores() // jobs)
+        threads = sweep.slurm.cpus if on_slurm else 1
         cells = [Cell.of(replace(cell.config, threads=threads)) for cell in cells]
     settings = cells[0].config  # one command has one device, and overwrites all cells or none
     if not on_slurm:

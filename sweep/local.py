@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -131,10 +130,3 @@ def run_queue(entries: Sequence[Entry], jobs: int, stop_if_asked: Callable[[], N
     if elsewhere:
         return Exit.BAD_INPUT
     return Exit.DIVERGED if display.diverged else Exit.DONE
-
-
-def cores() -> int:
-    """The number of CPU cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

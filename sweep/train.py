@@ -52,7 +52,7 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
         torch.cuda.set_device(config.device)
-    check_constraint(config.env)
+    check_constraint(config.env, config.simulator)
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     if config.steps <= config.learning_starts:
         print(
@@ -101,7 +101,7 @@ def make_trainer(
 
     Raises ConfigError if the networks and the replay buffer do not fit into memory.
     """
-    make_env = partial(envs.make, config.env)
+    make_env = partial(envs.make, config.env, simulator=config.simulator)
     train_envs = [make_env() for _ in seeds]
     obs_dim = train_envs[0].observation_space.shape[0]
     try:
@@ -124,10 +124,13 @@ def check_device(name: str) -> None:
         raise ConfigError(f"bad value {name!r} for device{hint} (choices: {', '.join(choices)})")
 
 
-def check_constraint(task: str) -> None:
-    """Raise ConfigError if the constraint of `task` does not work on its robot."""
+def check_constraint(task: str, simulator: str | None) -> None:
+    """Raise ConfigError if the constraint of `task` does not work on its robot, or if the simulator is not there."""
     constraint = TASKS[task].constraint
-    env = envs.make(task)
+    try:
+        env = envs.make(task, simulator=simulator)
+    except envs.UnavailableError as error:
+        raise ConfigError(str(error)) from error
     try:
         obs = torch.from_numpy(env.reset(seed=0)[0]).float().unsqueeze(0)
         if constraint.dim != env.robot.action_dim:

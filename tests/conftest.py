@@ -3,6 +3,8 @@
 
 import os
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before PyTorch is imported; the processes that tests start inherit it
+
 import pytest
 import torch
 from helpers import CHECKPOINTED, outcome, train

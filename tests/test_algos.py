@@ -462,12 +462,36 @@ def test_exploration_adds_noise_before_the_map(name):
         for i in only:
             if name in TD3_NAMES:
                 raw = mlp(agent.actor, i, obs[i : i + 1])[0]
-                wanted = (raw.tanh() + 0.7 * drawn[i]).clamp(-1, 1) if squashes(agent) else raw + 0.7 * drawn[i]
+                wanted = (raw.tanh() if squashes(agent) else raw) + 0.7 * drawn[i]
             else:
                 mean, std, _ = moments(agent, agent.actor, i, obs[i : i + 1])
                 wanted = (mean + std * drawn[i])[0]
                 wanted = wanted.tanh() if squashes(agent) else wanted
             torch.testing.assert_close(found[i], wanted.detach())
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_acting_maps_explored_suggestions_and_pulls_random_ones_back(name):
+    agent, obs = make_agent(name, **({"action_noise": 2.0} if name in TD3_NAMES else {})), make_batch().obs[:, 0]
+    twin = make_agent(name, **({"action_noise": 2.0} if name in TD3_NAMES else {}))
+    center = agent.centers(obs)
+    assert (center is None) == (map_of(agent) == "project")
+    for warming_up, exploring in (([0], [1]), ([1], [0]), ([0, 1], []), ([], [0, 1])):
+        found = agent.act(obs, center, warming_up, exploring)
+        suggested = torch.zeros(len(SEEDS), DIM)
+        if warming_up:
+            suggested[warming_up] = twin.warm_up(warming_up)[warming_up]
+        if exploring:
+            suggested[exploring] = twin.explore(obs, exploring)[exploring]
+        in_box = suggested.clamp(-1, 1) if squashes(agent) else suggested
+        executed = mapped(agent, obs, in_box, center)
+        pulled_back = CONSTRAINT.project if map_of(agent) == "project" else CONSTRAINT.alpha_map
+        executed[warming_up] = pulled_back(obs, suggested)[warming_up]
+        torch.testing.assert_close(found.executed, executed)
+        assert torch.equal(found.stored, in_box if agent.placement == "environment" else found.executed)
+        assert CONSTRAINT.violation(obs, found.executed).max() <= 1e-6
+    if name in TD3_NAMES:
+        assert (suggested.abs() > 1).any()
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

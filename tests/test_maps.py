@@ -1,6 +1,7 @@
-"""Maps as objects: the gauge map's density inside SAC, refused combinations, and a map of one's own."""
+"""Maps as objects, refused combinations, settings; a map and an off-policy algorithm of one's own."""
 
 import json
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -12,10 +13,12 @@ from algos.sac import SAC
 from algos.td3 import TD3
 from constraints import WeightedPositivePart
 from core.agent import Agent
-from core.config import keys_of, resolve, saved_settings, setting
+from core.config import NOT_NEGATIVE, Config, keys_of, resolve, saved_settings, setting
 from core.maps import Alpha, Gauge, Map, Project, Radial, Sample
+from core.networks import MLP, Adam, frozen_copy, rows_of, soft_update
 from core.words import ConfigError, split_names
 from envs import TASKS
+from plots.definitions import hyperparameter_table
 
 DIM, OBS = 2, 3
 CONSTRAINT = WeightedPositivePart(lambda obs: 2.0 * obs[..., :DIM] + 3.0, 0.8, DIM)  # its centre is not the origin
@@ -199,13 +202,11 @@ def test_centres_are_computed_once_and_replayed(monkeypatch):
     centers = agent.centers(obs)
     agent.sample(obs, centers, torch.zeros(1, 4, DIM))
     assert calls == [obs.shape] and agent.stores_centers
-    assert not Algorithm(TD3, Project(), "layer").map.stores_centers(CONSTRAINT)
-    assert not Soft().stores_centers(TASKS["HC+O"].constraint)  # its centre is the origin
+    assert not Algorithm(TD3, Project(), "layer").map.replays_center(CONSTRAINT)
+    assert not Soft().replays_center(TASKS["HC+O"].constraint)  # its centre is the origin
 
 
 def test_the_settings_of_a_map_are_keys_of_its_algorithms(monkeypatch):
-    from dataclasses import dataclass
-
     @dataclass
     class Scaled(Soft):
         scale: float = setting(1.0, "what it is multiplied with")
@@ -217,16 +218,6 @@ def test_the_settings_of_a_map_are_keys_of_its_algorithms(monkeypatch):
     # A setting that only densities use is none of TD3's.
     assert "entropy" not in keys_of(ALGORITHMS["DAlpha"].config_class)
     assert {"entropy", "boundary_weight"} <= keys_of(ALGORITHMS["SAlpha"].config_class).keys()
-
-
-def test_an_algorithm_of_ones_own_may_have_one_row_of_settings():
-    class Constant(TD3):
-        family = "Constant"
-        paper = {"Others": {"gamma": 0.5}}
-
-    row = Algorithm(Constant, Project(), "layer")
-    assert row.paper_config("Mine", "R+N", "Reacher", steps=7).gamma == 0.5
-    assert issubclass(Constant, Agent)
 
 
 # ---------------------------------------------------------------- settings
@@ -252,3 +243,72 @@ def test_saved_settings_come_back(name):
     assert saved_config(saved) == config
     # Older run folders have keys without a value, of settings that the algorithm does not have.
     assert saved_config({"fw_learning_rate": None, "gsde": None, "penalty": None} | saved) == config
+
+
+@dataclass
+class DDPGConfig(Config):
+    noise: float = setting(0.1, "DDPG: std of exploration noise", NOT_NEGATIVE)
+
+
+class DDPG(Agent):
+    """Lillicrap et al. (2016), written from `core.agent.Agent` alone."""
+
+    config: DDPGConfig
+    config_class = DDPGConfig
+    family = "DDPG"
+    paper = {"Others": {"gamma": 0.98, "tau": 0.05}}
+    placements = ("layer",)
+
+    def build(self, init):
+        self.actor = MLP([self.obs_dim, *self.config.hidden, self.action_dim], init).to(self.device)
+        self.critic = MLP([self.obs_dim + self.action_dim, *self.config.hidden, 1], init).to(self.device)
+        self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
+        self.steps = {
+            name: Adam(module.parameters(), self.config.learning_rate)
+            for name, module in (("actor", self.actor), ("critic", self.critic))
+        }
+
+    def networks(self):
+        names = ("actor", "critic", "actor_target", "critic_target")
+        return {name: getattr(self, name) for name in names}
+
+    def optimizers(self):
+        return self.steps
+
+    @torch.no_grad()
+    def explore(self, obs, which):
+        noise = self.config.noise * self.exploration.normal(self.action_dim, which=which)
+        return self.squash(self.actor(obs.unsqueeze(1))).squeeze(1) + noise
+
+    def policy(self, which):
+        actor = rows_of(self.actor, which)
+        return lambda obs: self.feasible(obs, self.squash(actor(obs)), None)
+
+    def q(self, critic, obs, action):
+        return critic(torch.cat([obs, action], -1)).squeeze(-1)
+
+    def update(self, batch):
+        with torch.no_grad():
+            suggested = self.squash(self.actor_target(batch.next_obs))
+            next_action = self.feasible(batch.next_obs, suggested, batch.next_center)
+            next_q = self.q(self.critic_target, batch.next_obs, next_action)
+            target = batch.reward + self.config.gamma * (1 - batch.terminated) * next_q
+        self.descend("critic", (self.q(self.critic, batch.obs, batch.action) - target).square().mean(-1))
+        suggested = self.squash(self.actor(batch.obs))
+        action = self.feasible(batch.obs, suggested, batch.center)
+        self.descend("actor", (self.penalty(batch.obs, suggested) - self.q(self.critic, batch.obs, action)).mean(-1))
+        soft_update(self.actor_target, self.actor, self.config.tau)
+        soft_update(self.critic_target, self.critic, self.config.tau)
+
+
+@pytest.mark.parametrize("map", [Project(), Alpha(), Radial(), Gauge(), Soft()], ids=lambda map: type(map).__name__)
+def test_an_off_policy_algorithm_of_ones_own_is_one_class_and_one_row(map, tmp_path, monkeypatch):
+    monkeypatch.setitem(ALGORITHMS, "Mine", Algorithm(DDPG, map, "layer", penalty=True))
+    words = "algo=Mine env=W+M seed=0,1 steps=100 learning_starts=40 batch_size=8 hidden=[8,8] noise=0.2 penalty=2"
+    assert config_of(words).gamma == 0.98
+    assert run_command([*words.split(), "eval_episodes=1", "final_episodes=1", f"results={tmp_path}"]) == 0
+    results = [json.loads(path.read_text()) for path in tmp_path.glob("*/*/seed=*/result.json")]
+    assert len(results) == 2 and all(result["gradient_steps"] == 59 for result in results)
+    assert all(result["largest_violation"] <= 1e-6 for result in results)
+    # The table of hyperparameters gets a column of its own.
+    assert ("Others", "DDPG") in {(r["robot"], r["base"]) for r in hyperparameter_table().records}

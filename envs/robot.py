@@ -1,0 +1,72 @@
+"""What a robot of a task is: the protocol that every simulation follows."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+Step = tuple[np.ndarray, float, bool, dict[str, Any]]
+"""What a step returns: observation (n,), reward, whether the episode ended for good, info."""
+
+
+class UnavailableError(ValueError):
+    """A simulator is not installed on this machine, or the robot does not have it; the message is one line."""
+
+
+class Robot(ABC):
+    """One simulated robot. A robot of your own derives from this class and appears in a row of `envs.TASKS`.
+
+    An episode must depend on its reset and its actions alone, not on earlier episodes. Observations are new float64
+    arrays, which the caller may keep and change. The environment around a robot checks actions, counts steps and ends
+    an episode after `max_episode_steps`; a robot does none of that.
+    """
+
+    obs_dim: int
+    action_dim: int
+    max_episode_steps: int
+    fps: int
+    """Steps in a second of simulated time, at which a video shows real time."""
+    hyperparameters: str = "Others"
+    """The group of robots in the paper's table of hyperparameters whose values algorithms take."""
+    simulators: Mapping[str, str] = {}
+    """The simulators among which a user can choose: name -> "module:class", imported when chosen. The first is this
+    class itself; a robot without a choice has none."""
+
+    @abstractmethod
+    def reset(self, rng: np.random.Generator) -> np.ndarray:
+        """Start an episode, with all random numbers from `rng`; return the observation (obs_dim,)."""
+
+    @abstractmethod
+    def step(self, action: np.ndarray) -> Step:
+        """Execute `action` (action_dim,), float32 or float64, in [-1, 1]; return what `Step` says."""
+
+    @classmethod
+    def step_together(cls, robots: Sequence[Robot], actions: Sequence[np.ndarray]) -> list[Step]:
+        """Step each of `robots`, all of this class, with its action; what `step` of each would return, in every bit.
+
+        Override this where one call for all is faster than a loop.
+        """
+        return [robot.step(action) for robot, action in zip(robots, actions, strict=True)]
+
+    def get_state(self) -> np.ndarray | None:
+        """The robot's state in an episode as float64 numbers (k,), from which `set_state` continues in every bit.
+
+        None, the default, means that there is no such state. A checkpoint then keeps the actions of the episode, and a
+        resumed run repeats them.
+        """
+        return None
+
+    def set_state(self, state: np.ndarray) -> np.ndarray:
+        """Take up a state (k,) that `get_state` returned, also in another process; return its observation."""
+        raise TypeError(f"{type(self).__name__} has no state to set")
+
+    @abstractmethod
+    def render(self) -> np.ndarray:
+        """Picture (480, 480, 3), uint8, of the present state."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free what the simulator holds; closing twice is harmless."""

@@ -1,0 +1,79 @@
+"""The choice of a simulator on the command line, and checkpoints of another version, as a user meets them."""
+
+import hashlib
+import io
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+SHORT = "learning_starts=16 batch_size=4 hidden=[8] eval_every=30 eval_episodes=1 final_episodes=1"
+BLOCKED = "import runpy, sys; sys.modules['pybullet'] = None; runpy.run_path('run.py', run_name='__main__')"
+
+
+def run(words, *program):
+    command = [sys.executable, *(program or ["run.py"]), *words.split()]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+
+
+def test_a_simulator_that_the_robot_does_not_have_is_one_line():
+    for words, said in (
+        ("env=R+N simulator=mujoco", "unknown simulator 'mujoco' for R+N (choices: closed-form pybullet)"),
+        ("env=W+M simulator=pybullet", "simulator does not apply to DPre on W+M"),
+    ):
+        done = run(f"algo=DPre {words}")
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"run.py: {said}\n")
+
+
+def test_pybullet_where_it_is_not_installed_is_one_line(tmp_path):
+    done = run(f"algo=DPre env=R+N simulator=pybullet results={tmp_path}", "-c", BLOCKED)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert (
+        "run.py: simulator 'pybullet' needs the package pybullet, which has wheels for Linux on x86-64 with"
+        in done.stderr
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_pybullet_trains_as_the_closed_form_does(tmp_path):
+    pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    evaluations = []
+    for simulator in ("closed-form", "pybullet"):
+        words = f"algo=DPre env=R+L2,H+M steps=30 {SHORT} simulator={simulator} results={tmp_path / simulator}"
+        assert run(words).returncode == 0
+        for task, expected in (("R+L2", simulator), ("H+M", None)):  # a key goes to the tasks that have it
+            (folder,) = (tmp_path / simulator / task).glob("*/seed=0")
+            assert yaml.safe_load((folder / "config.yaml").read_text())["simulator"] == expected
+            assert "simulator" not in folder.parent.name
+        (file,) = (tmp_path / simulator).glob("R+L2/*/seed=0/evaluations.csv")
+        evaluations.append(float(file.read_text().splitlines()[-1].split(",")[1]))
+    assert evaluations[0] == pytest.approx(evaluations[1], abs=1e-4)
+
+
+def test_a_checkpoint_of_another_version_is_refused_and_can_be_overwritten(tmp_path):
+    words = f"algo=DPre env=R+N steps=1000000 checkpoint_every=40 results={tmp_path} {SHORT}".replace(
+        "eval_every=30", "eval_every=1000"
+    )
+    process = subprocess.Popen([sys.executable, "run.py", *words.split()], cwd=ROOT, stderr=subprocess.DEVNULL)
+    while not (states := list(tmp_path.glob("R+N/*/seed=0/checkpoint/state-*.pt"))):
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 143
+    states = list(tmp_path.glob("R+N/*/seed=0/checkpoint/state-*.pt"))
+    for path in states:
+        content = torch.load(io.BytesIO(path.read_bytes().partition(b"\n")[2]), weights_only=True)
+        del content["format"]
+        torch.save(content, body := io.BytesIO())
+        path.write_bytes(hashlib.sha256(body.getvalue()).hexdigest().encode() + b"\n" + body.getvalue())
+    done = run(words)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "was written by another version of this code" in done.stderr and "overwrite=true" in done.stderr
+    assert all(path.exists() for path in states)
+    short = words.replace("steps=1000000", "steps=30")
+    assert run(f"{short} overwrite=true").returncode == 0

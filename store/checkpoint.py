@@ -157,7 +157,7 @@ class CheckpointFolder:
     def read(self) -> tuple[list[Checkpoint], list[str]]:
         """The intact checkpoints, newest first, and a line for each damaged one.
 
-        Raises FormatError if one is of another version of this code.
+        Raises FormatError if another version of this code wrote one.
         """
         intact, problems = [], []
         digests: dict[str, str] = {}  # of replay files, most of which both checkpoints name

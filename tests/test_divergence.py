@@ -232,10 +232,10 @@ def test_an_evaluation_with_a_refused_action(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("what", ["observation", "reward"])
 def test_an_environment_that_breaks_down(tmp_path, monkeypatch, what):
-    execute = ActionConstrainedEnv._execute
+    record = ActionConstrainedEnv._record
 
-    def spoiled(self, action, violation):
-        obs, reward, *rest = execute(self, action, violation)
+    def spoiled(self, action, step):
+        obs, reward, *rest = record(self, action, step)
         # Seed 5 alone stands here at its 30th step.
         if self.executed_actions == 30 and np.isclose(obs[0], target[0]):
             obs, reward = (obs * math.nan, reward) if what == "observation" else (obs, math.inf)
@@ -243,7 +243,7 @@ def test_an_environment_that_breaks_down(tmp_path, monkeypatch, what):
 
     words = f"algo=DPre env=R+N {WORDS}"
     target = envs.make("R+N").reset(seed=stream_seed(5, "environment"))[0]
-    monkeypatch.setattr(ActionConstrainedEnv, "_execute", spoiled)
+    monkeypatch.setattr(ActionConstrainedEnv, "_record", spoiled)
     assert run_command([*words.split(), f"results={tmp_path}"]) == 3
     ((name, failure),) = failures(tmp_path).items()
     assert name == "seed=5" and failure["quantity"] == "observation or reward is not finite" and failure["step"] == 29

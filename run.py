@@ -5,11 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from functools import partial
 
 from algos import ALGORITHMS, setting_keys
 from envs import TASKS
 from sweep.cells import make_cells
-from sweep.exit import Exit, exit_code
+from sweep.exit import Exit, exit_code, stoppable
 from sweep.launch import launch
 from sweep.settings import SLURM_PREFIX, SlurmSettings, SweepSettings, parse_sweep
 from sweep.status import describe_status
@@ -42,10 +43,7 @@ def usage() -> str:
 
 
 def carry_out(arguments: Sequence[str], stop_if_asked: Callable[[], None]) -> Exit:
-    """Do what the arguments ask for. `stop_if_asked` raises Interrupted once a signal has asked for the end."""
-    if arguments[0] == "status":
-        print(describe_status(arguments[1:]))
-        return Exit.DONE
+    """Train what the arguments ask for. `stop_if_asked` raises Interrupted once a signal has asked for the end."""
     sweep, settings = parse_sweep(arguments)
     cells = make_cells(settings)
     if sweep.wanted:
@@ -58,7 +56,9 @@ def main(arguments: Sequence[str]) -> int:
     if not arguments or {"-h", "--help", "help"} & set(arguments):
         print(usage())
         return Exit.DONE
-    return exit_code(lambda stop_if_asked: carry_out(arguments, stop_if_asked))
+    if arguments[0] == "status":
+        return exit_code(lambda: print(describe_status(arguments[1:])) or Exit.DONE)
+    return exit_code(lambda: stoppable(partial(carry_out, arguments)))
 
 
 if __name__ == "__main__":

@@ -29,9 +29,10 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])
 import numpy as np
 
 import envs
-from envs.reacher import FLOATS, LIMIT, advance
+from core.words import ConfigError, parse_words, whole_number, whole_numbers
+from envs.reacher import FLOATS, LIMIT, TORQUE, advance
 
-EPISODE, TORQUE = 150, 0.05
+EPISODE = 150
 KINDS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
     "uniform": lambda rng: rng.uniform(-1, 1, (EPISODE, 2)),
     "constant": lambda rng: rng.choice([-1.0, 1.0], (1, 2)).repeat(EPISODE, 0),
@@ -115,12 +116,20 @@ def training(seeds: list[int]) -> None:
             )
 
 
-def main(arguments: list[str]) -> None:
-    options = {"steps": "140000", "seeds": "1,10"} | dict(word.split("=", 1) for word in arguments)
-    equality(int(options["steps"]))
+def main(arguments: list[str]) -> int:
+    """Exit code: 0 done, 2 bad input."""
+    options = {"steps": "140000", "seeds": "1,10"}
+    try:
+        options |= parse_words(arguments, options)
+        steps, seeds = whole_number("steps", options["steps"]), whole_numbers("seeds", options["seeds"])
+    except ConfigError as error:
+        print(f"bench/reacher.py: {error}", file=sys.stderr)
+        return 2
+    equality(steps)
     speed()
-    training([int(n) for n in options["seeds"].split(",")])
+    training(seeds)
+    return 0
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

@@ -99,7 +99,7 @@ class Config:
     results: str = setting("results", "folder that results go to")
     overwrite: bool = setting(False, "start again in any case; the old run is kept")
     simulator: str | None = setting(
-        None, "Reacher: 'closed-form', or 'pybullet', its reference, where that is installed"
+        None, "simulator of the robot, where there is a choice (Reacher: closed-form, pybullet)"
     )
     device: str = setting(
         "cpu",

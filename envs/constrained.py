@@ -169,7 +169,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go back to what `get_state` described; after an episode that was over, the next call must be a reset.
+        """Go back to what `get_state` described; if the saved episode had ended, call reset() next.
 
         A robot without a state of its own repeats an episode in progress. Raises ValueError for the state of another
         robot or simulator.

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from envs.reacher import Reacher
+from envs.reacher import TIME_STEP, TORQUE, Reacher
 from envs.robot import Robot, Step, UnavailableError
 
 
@@ -64,7 +64,7 @@ class PyBulletReacher(Robot):
         bullet.setGravity(0, 0, 0, physicsClientId=client)
         bullet.setDefaultContactERP(0.9, physicsClientId=client)
         bullet.setPhysicsEngineParameter(
-            fixedTimeStep=0.0165, numSolverIterations=5, numSubSteps=1, physicsClientId=client
+            fixedTimeStep=TIME_STEP, numSolverIterations=5, numSubSteps=1, physicsClientId=client
         )
         # name -> (body, index), for joints and for links alike
         self._joints, self._links = {}, {}
@@ -78,8 +78,9 @@ class PyBulletReacher(Robot):
 
     def reset(self, rng: np.random.Generator) -> np.ndarray:
         """Draw target and joint positions from `rng` (numpy Generator); return the observation (9,)."""
-        target = rng.uniform(-0.27, 0.27), rng.uniform(-0.27, 0.27)
-        self.place(rng.uniform(-3.14, 3.14), rng.uniform(-3.14, 3.14), 0.0, 0.0, target)
+        start = Reacher()
+        start.reset(rng)
+        self.place(*start.state[:4], target=start.state[4:6])
         return self._observe()[0]
 
     def place(self, q1: float, q2: float, w1: float, w2: float, target: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -104,7 +105,7 @@ class PyBulletReacher(Robot):
     def step(self, action: np.ndarray) -> Step:
         """Apply `action` (2,) for 0.0165 s; return obs (9,), reward, False (never ends), info."""
         a0, a1 = map(float, action)
-        self.advance(*(0.05 * min(max(a, -1.0), 1.0) for a in (a0, a1)))
+        self.advance(*(TORQUE * min(max(a, -1.0), 1.0) for a in (a0, a1)))
         obs, potential = self._observe()
         progress, self._potential = potential - self._potential, potential
         electricity = -0.10 * (abs(a0 * obs[6]) + abs(a1 * obs[8])) - 0.01 * (abs(a0) + abs(a1))

@@ -167,7 +167,7 @@ class CheckpointFolder:
                 if content.get("format") != FORMAT:
                     raise FormatError(
                         f"{path} was written by another version of this code, and this one cannot resume from it;"
-                        " overwrite=true starts the run again and keeps the old one"
+                        " overwrite=true starts the run again and keeps the old one, seed= can leave it out"
                     )
                 files = tuple(ReplayFile(*file) for file in content["replay_files"])
                 for file in files:

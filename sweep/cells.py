@@ -18,7 +18,7 @@ from typing import Any
 
 from algos import ALGORITHMS, PAPER, paper_settings, setting_keys
 from core.config import Config, differences, keys_that_apply, resolve
-from core.words import ConfigError, parse_words, split_names
+from core.words import ConfigError, known_name, parse_words, split_names
 from envs import TASKS
 from store.files import replace_file
 from store.folder import parse_variant, run_folder, variant_name
@@ -143,6 +143,9 @@ def make_cells(settings: Mapping[str, str]) -> list[Cell]:
         # A key that no algorithm has is a mistake, which `resolve` reports.
         return key in keys_that_apply(paper) or not any(key in keys_that_apply(other) for other in papers)
 
+    for task in tasks if "simulator" in settings else ():
+        if simulators := TASKS[task].robot.simulators:
+            known_name(f"simulator of {task}", settings["simulator"], simulators)
     return [
         Cell.of(resolve(paper, {key: text for key, text in settings.items() if applies(key, paper)}))
         for paper in papers

@@ -24,14 +24,16 @@ class Exit(IntEnum):
     FAILED = 4  # a cell of a sweep failed
 
 
-def exit_code(command: Callable[[Callable[[], None]], int]) -> int:
-    """Run `command` and return its exit code. An error that the user can correct becomes one line on stderr.
+def stoppable(command: Callable[[Callable[[], None]], Exit]) -> Exit:
+    """Run `command` with a function that raises Interrupted once a signal has asked for the end."""
+    with Interrupts() as interrupts:
+        return command(interrupts.stop_if_asked)
 
-    `command` receives a function that raises Interrupted once a signal has asked for the end.
-    """
+
+def exit_code(command: Callable[[], Exit]) -> int:
+    """Run `command` and return its exit code. An error that the user can correct becomes one line on stderr."""
     try:
-        with Interrupts() as interrupts:
-            return command(interrupts.stop_if_asked)
+        return command()
     except (ConfigError, ConstraintError, FormatError, LockedError) as error:
         print(f"run.py: {one_line(error)}", file=sys.stderr)
         return Exit.BAD_INPUT

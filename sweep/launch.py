@@ -14,7 +14,7 @@ from sweep.plan import describe_plan, make_plan, memory_warning
 from sweep.settings import Sweep
 from sweep.slurm import check_gpus, submit
 from sweep.states import job_states
-from sweep.train import check_device
+from sweep.train import check_device, make_env
 
 
 def launch(sweep: Sweep, cells: Sequence[Cell], threads_given: bool, stop_if_asked: Callable[[], None]) -> Exit:
@@ -31,6 +31,8 @@ def launch(sweep: Sweep, cells: Sequence[Cell], threads_given: bool, stop_if_ask
     settings = cells[0].config  # one command has one device, and overwrites all cells or none
     if not on_slurm:
         check_device(settings.device)
+        for task, simulator in {(cell.task, cell.config.simulator) for cell in cells if cell.config.simulator}:
+            make_env(task, simulator).close()  # where it is not installed, no cell should start
     elif settings.overwrite:
         raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
     else:

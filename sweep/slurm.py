@@ -27,7 +27,7 @@ from store.files import one_line
 from store.folder import has_ended
 from store.lock import LockedError, run_lock
 from sweep.cells import RECORDS, Cell
-from sweep.exit import Exit, exit_code
+from sweep.exit import Exit, exit_code, stoppable
 from sweep.plan import Entry, make_plan
 from sweep.settings import SIGNAL_DELAY, SlurmSettings, Sweep
 from sweep.states import NO_ANSWER, Stage, count_states, job_states
@@ -182,7 +182,7 @@ class Job:
         requeue: Any = signal.signal(signum, lambda *_: None)
         log, before = environment.paths.stderr, self._progress()
         try:
-            code = exit_code(partial(train_cells, [self.cell]))
+            code = exit_code(partial(stoppable, partial(train_cells, [self.cell])))
         except Exception:
             self.cell.note_end(1, log)
             raise

@@ -17,23 +17,28 @@ from core.config import RUN_KEYS, Config, saved_settings
 from core.trainer import Trainer
 from core.words import ConfigError, parse_words
 from envs import TASKS, TOLERANCE
-from store.checkpoint import Checkpoint, CheckpointFolder, group_checkpoints
+from store.checkpoint import Checkpoint, CheckpointFolder, FormatError, group_checkpoints
 from store.files import one_line
 from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
 from store.interrupt import Interrupted
 from store.lock import run_lock
 from store.provenance import describe_environment
 from sweep.cells import Cell, make_cells
-from sweep.exit import Exit
+from sweep.exit import Exit, stoppable
 
 
 def train_words(words: str) -> bool:
-    """Train the cells that `words` ask for, as `python run.py <words>` does, in this process.
+    """Train the cells that `words` ask for, as `python run.py <words>` does, one after the other in this process.
 
-    Returns whether every seed has a result; a seed that diverged has none. Raises ConfigError for wrong words,
-    ConstraintError for a constraint that breaks down and LockedError if another process trains a run.
+    Returns whether every seed has a result; a seed that diverged has none. Ctrl-C writes a checkpoint and ends the
+    program; the same call resumes. Raises ConfigError for wrong words, ConstraintError for a constraint that breaks
+    down and LockedError if another process trains a run.
     """
-    return train_cells(make_cells(parse_words(words.split(), setting_keys()))) is Exit.DONE
+    cells = make_cells(parse_words(words.split(), setting_keys()))
+    try:
+        return stoppable(partial(train_cells, cells)) is Exit.DONE
+    except Interrupted as interrupted:
+        raise SystemExit(128 + interrupted.signum) from None
 
 
 def train_cells(cells: Sequence[Cell], stop_if_asked: Callable[[], None] = lambda: None) -> Exit:
@@ -101,12 +106,12 @@ def make_trainer(
 
     Raises ConfigError if the networks and the replay buffer do not fit into memory.
     """
-    make_env = partial(envs.make, config.env, simulator=config.simulator)
-    train_envs = [make_env() for _ in seeds]
+    new_env = partial(make_env, config.env, config.simulator)
+    train_envs = [new_env() for _ in seeds]
     obs_dim = train_envs[0].observation_space.shape[0]
     try:
         agent = ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, list(seeds))
-        return Trainer(config, agent, train_envs, make_env, envs.step_together, writers, progress, stop_if_asked)
+        return Trainer(config, agent, train_envs, new_env, envs.step_together, writers, progress, stop_if_asked)
     except RuntimeError as error:
         if not any(words in str(error) for words in ("allocate memory", "out of memory")):
             raise
@@ -124,13 +129,18 @@ def check_device(name: str) -> None:
         raise ConfigError(f"bad value {name!r} for device{hint} (choices: {', '.join(choices)})")
 
 
+def make_env(task: str, simulator: str | None) -> envs.ActionConstrainedEnv:
+    """The environment of `task`. Raises ConfigError if the simulator is not there."""
+    try:
+        return envs.make(task, simulator=simulator)
+    except envs.UnavailableError as error:
+        raise ConfigError(str(error)) from error
+
+
 def check_constraint(task: str, simulator: str | None) -> None:
     """Raise ConfigError if the constraint of `task` does not work on its robot, or if the simulator is not there."""
     constraint = TASKS[task].constraint
-    try:
-        env = envs.make(task, simulator=simulator)
-    except envs.UnavailableError as error:
-        raise ConfigError(str(error)) from error
+    env = make_env(task, simulator)
     try:
         obs = torch.from_numpy(env.reset(seed=0)[0]).float().unsqueeze(0)
         if constraint.dim != env.robot.action_dim:
@@ -153,7 +163,12 @@ def _find_checkpoints(folders: dict[int, Path], ended: set[int]) -> tuple[list[d
     """Groups of seeds that resume together, each seed with its checkpoint, and the seeds that start anew."""
     intact, started = {}, {}
     for seed, folder in folders.items():
-        checkpoints, problems = CheckpointFolder(folder).read()
+        try:
+            checkpoints, problems = CheckpointFolder(folder).read()
+        except FormatError:
+            if seed in ended:  # its neighbours in the batch may still need the checkpoint, in that version
+                continue
+            raise
         if not checkpoints and seed in ended:  # left by a crash during their deletion
             CheckpointFolder(folder).remove()
             continue
@@ -187,18 +202,23 @@ def _resume(
             print(f"{folders[seed]}: resuming from step {group[seed].step}")
     if len(seeds) < len(before):
         print(f"(trained with other seeds before, {len(before)} in all: equal up to rounding to an unbroken run)")
+    if (threads := group[seeds[0]].settings["threads"]) != config.threads:
+        print(f"(trained with threads={threads} before: equal up to rounding to an unbroken run)")
     trainer = make_trainer(config, seeds, writers, True, stop_if_asked)
     trainer.restore([group[seed] for seed in seeds])
     _run(trainer)
 
 
 def _check_settings(folder: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
-    """Raise ConfigError if a setting that decides what is learned differs from the one that the run started with."""
-    for key in now.keys() - set(RUN_KEYS):
+    """Raise ConfigError if a setting that decides what is learned differs from the one that the run started with.
+
+    So does the simulator, because the state of one does not fit another.
+    """
+    for key in now.keys() - (set(RUN_KEYS) - {"simulator"}):
         if before.get(key) != now[key]:
             raise ConfigError(
-                f"{folder} was started with {key}={before.get(key)}, which is {now[key]}"
-                " now; overwrite=true starts it again and keeps the old one"
+                f"{folder} started with {key}={before.get(key)}, but this command has {key}={now[key]}; use the old"
+                " value, or overwrite=true to start again and keep the old run"
             )
 
 

@@ -9,6 +9,7 @@ import pytest
 from helpers import CHECKPOINTED, Breaks, assert_identical, outcome, run_command
 
 from store.interrupt import Interrupted, Interrupts
+from sweep.train import train_words
 
 ROOT = Path(__file__).parents[1]
 
@@ -45,6 +46,31 @@ def test_handlers_are_put_back_and_an_ignored_signal_stays_ignored():
         "print(signal.getsignal(signal.SIGTERM) == signal.SIG_DFL, signal.getsignal(signal.SIGINT) == signal.SIG_IGN)\n"
     )
     assert done.returncode == 0 and done.stdout.split() == ["True", "True"], done.stderr
+
+
+def test_a_program_of_ones_own_that_trains_ends_with_a_checkpoint_too(tmp_path, capsys, monkeypatch, unbroken):
+    check = Breaks(77, error=Interrupted(signal.SIGINT))
+    monkeypatch.setattr(Interrupts, "stop_if_asked", lambda self: check())
+    words = f"{CHECKPOINTED} results={tmp_path}"
+    with pytest.raises(SystemExit) as ended:
+        train_words(words)
+    assert ended.value.code == 130 and "the same command resumes" in capsys.readouterr().err
+    assert train_words(words)
+    assert capsys.readouterr().out.count("resuming from step") == 2
+    assert_identical(outcome(tmp_path), unbroken)
+
+
+def test_a_first_ctrl_c_ends_a_command_that_does_not_train():
+    done = script(
+        "import os, signal, time, run\n"
+        "def describe(words):\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    time.sleep(5)\n"
+        "    return 'never'\n"
+        "run.describe_status = describe\n"
+        "print(run.main(['status']))\n"
+    )
+    assert done.stdout.split() == ["130"]
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])

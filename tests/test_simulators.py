@@ -24,7 +24,8 @@ def run(words, *program):
 
 def test_a_simulator_that_the_robot_does_not_have_is_one_line():
     for words, said in (
-        ("env=R+N simulator=mujoco", "unknown simulator 'mujoco' for R+N (choices: closed-form pybullet)"),
+        ("env=R+N simulator=mujoco", "unknown simulator of R+N 'mujoco' (choices: closed-form, pybullet)"),
+        ("env=R+N,W+M simulator=foo jobs=2", "unknown simulator of R+N 'foo' (choices: closed-form, pybullet)"),
         ("env=W+M simulator=pybullet", "simulator does not apply to DPre on W+M"),
     ):
         done = run(f"algo=DPre {words}")
@@ -56,24 +57,69 @@ def test_pybullet_trains_as_the_closed_form_does(tmp_path):
     assert evaluations[0] == pytest.approx(evaluations[1], abs=1e-4)
 
 
-def test_a_checkpoint_of_another_version_is_refused_and_can_be_overwritten(tmp_path):
-    words = f"algo=DPre env=R+N steps=1000000 checkpoint_every=40 results={tmp_path} {SHORT}".replace(
-        "eval_every=30", "eval_every=1000"
-    )
+def interrupt(words, root):
+    """Start the command, and end it with SIGTERM when it has a checkpoint; the files of its state."""
     process = subprocess.Popen([sys.executable, "run.py", *words.split()], cwd=ROOT, stderr=subprocess.DEVNULL)
-    while not (states := list(tmp_path.glob("R+N/*/seed=0/checkpoint/state-*.pt"))):
+    while not list(root.glob("R+N/*/seed=0/checkpoint/state-*.pt")):
+        assert process.poll() is None
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 143
-    states = list(tmp_path.glob("R+N/*/seed=0/checkpoint/state-*.pt"))
+    return list(root.glob("R+N/*/seed=?/checkpoint/state-*.pt"))
+
+
+def make_old(states):
+    """Take the number of the format out of these files, as files had none at first."""
     for path in states:
         content = torch.load(io.BytesIO(path.read_bytes().partition(b"\n")[2]), weights_only=True)
         del content["format"]
         torch.save(content, body := io.BytesIO())
         path.write_bytes(hashlib.sha256(body.getvalue()).hexdigest().encode() + b"\n" + body.getvalue())
+
+
+LONG = f"algo=DPre env=R+N steps=1000000 checkpoint_every=40 {SHORT}".replace("eval_every=30", "eval_every=1000")
+
+
+def test_a_checkpoint_of_another_version_is_refused_and_can_be_overwritten(tmp_path):
+    words = f"{LONG} results={tmp_path}"
+    states = interrupt(words, tmp_path)
+    make_old(states)
     done = run(words)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert "was written by another version of this code" in done.stderr and "overwrite=true" in done.stderr
     assert all(path.exists() for path in states)
-    short = words.replace("steps=1000000", "steps=30")
-    assert run(f"{short} overwrite=true").returncode == 0
+    assert run(f"{words} overwrite=true".replace("steps=1000000", "steps=30")).returncode == 0
+
+
+def test_a_finished_seed_does_not_need_its_checkpoint_of_another_version(tmp_path):
+    words = f"{LONG} results={tmp_path}"
+    states = interrupt(words, tmp_path)
+    make_old(states)
+    result = states[0].parents[1] / "result.json"
+    result.write_text('{"return_mean": 1.5, "returns": [1.5]}')
+    done = run(words)
+    assert done.returncode == 0 and "already finished" in done.stdout, done.stderr
+
+
+def test_a_run_does_not_change_its_simulator(tmp_path):
+    pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    words = f"{LONG} results={tmp_path}"
+    states = interrupt(words, tmp_path)
+    config = states[0].parents[1] / "config.yaml"
+    before = config.read_text()
+    done = run(f"{words} simulator=pybullet")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "started with simulator=closed-form, but this command has simulator=pybullet" in done.stderr
+    assert config.read_text() == before
+
+
+def test_a_resumed_run_tells_that_its_threads_have_changed(tmp_path):
+    words = f"{LONG} results={tmp_path}"
+    interrupt(f"{words} threads=2", tmp_path)
+    process = subprocess.Popen(
+        [sys.executable, "run.py", *words.split(), "threads=1"], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    said = [process.stdout.readline() for _ in range(2)]
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 143
+    assert "resuming from step" in said[0] and "trained with threads=2 before: equal up to rounding" in said[1]

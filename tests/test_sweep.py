@@ -133,6 +133,7 @@ def test_seeds_as_words(text):
 
 def test_the_words_of_a_cell_are_the_same_cell(tmp_path):
     words = "algo=paper env=R+L2,W+M seed=0-9 hidden=[64,32] gamma=0.5 fw_learning_rate=0.5 gsde=false train_freq=7"
+    words += " simulator=pybullet"
     cells = cells_of([*words.split(), f"results={tmp_path}", "threads=3"])
     assert len(cells) == 26
     for cell in cells:

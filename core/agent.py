@@ -22,6 +22,7 @@ from core.snapshot import Snapshots, parameters_of
 class Action(NamedTuple):
     """Actions (seeds, d) on the CPU."""
 
+    suggested: Tensor  # before any clamp or map
     executed: Tensor  # what the robot does
     stored: Tensor  # what the replay buffer keeps and the critic learns from
 
@@ -137,12 +138,13 @@ class Agent(Snapshots):
 
         obs (seeds, n) and `center` (seeds, d), from `centers`, are on the CPU. Other rows of the actions are junk.
         """
-        suggested = torch.zeros(len(self.seeds), self.action_dim)
+        raw = torch.zeros(len(self.seeds), self.action_dim)
         if warming_up:
-            suggested[warming_up] = self.warm_up(warming_up)[warming_up].cpu()
+            raw[warming_up] = self.warm_up(warming_up)[warming_up].cpu()
         if exploring:
-            explored = self.explore(obs.to(self.device), exploring)[exploring].cpu()
-            suggested[exploring] = explored.clamp(-1.0, 1.0) if self.map.squashes else explored
+            raw[exploring] = self.explore(obs.to(self.device), exploring)[exploring].cpu()
+        suggested = raw.clamp(-1.0, 1.0) if self.map.squashes else raw
+        if exploring:
             executed = self.feasible(obs, suggested, center)
         if warming_up:
             pulled_back = self.map.pull_back(self.constraint, obs, suggested, center)
@@ -150,7 +152,7 @@ class Agent(Snapshots):
                 executed[warming_up] = pulled_back[warming_up]
             else:
                 executed = pulled_back
-        return Action(executed, suggested if self.placement == "environment" else executed)
+        return Action(raw, executed, suggested if self.placement == "environment" else executed)
 
     def centers(self, obs: Tensor) -> Tensor | None:
         """The centres (..., d) of the sets at obs (..., n), None where the map needs none but the origin."""

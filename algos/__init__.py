@@ -27,7 +27,8 @@ class Algorithm:
     penalty: bool = False
 
     def __post_init__(self) -> None:
-        self.agent.check_combination(self.map, self.placement)
+        self.agent.check_combination(self.map, self.placement, self.penalty)
+        self._check_settings()
 
     @cached_property
     def config_class(self) -> type[Config]:
@@ -36,8 +37,26 @@ class Algorithm:
         for f in fields(self.map):
             if self.agent.needs_log_prob or not f.metadata.get("of_density"):
                 own.append((f.name, hints[f.name], field(default=getattr(self.map, f.name), metadata=f.metadata)))
-        bases = (self.agent.config_class, *([PenaltyConfig] if self.penalty else []))
-        return make_dataclass(f"{self.agent.__name__}Config", own, bases=bases)
+        return make_dataclass(f"{self.agent.__name__}Config", own, bases=self._bases)
+
+    @property
+    def _bases(self) -> tuple[type[Config], ...]:
+        """The dataclasses of the settings that are not the map's."""
+        return (self.agent.config_class, *([PenaltyConfig] if self.penalty else []))
+
+    def _check_settings(self) -> None:
+        """Raise ValueError for a field that cannot be a key of the command line."""
+        taken = {word for base in self._bases for key, f in keys_of(base).items() for word in (key, f.name)}
+        for key, f in keys_of(self.map).items():
+            if {key, f.name} & taken:
+                raise ValueError(
+                    f"{type(self.map).__name__}.{f.name} has the name of a setting of {self.agent.__name__}"
+                )
+        inherited = keys_of(Config)
+        for schema in (type(self.map), self.agent.config_class):
+            for key, f in keys_of(schema).items():
+                if "help" not in f.metadata and key not in inherited:
+                    raise ValueError(f"{schema.__name__}.{f.name} must be made with core.config.setting")
 
     def paper_config(self, name: str, task: str, group: str, steps: int) -> Config:
         """The settings of the paper's table for a `group` of robots; "Others" where the algorithm has no such row."""

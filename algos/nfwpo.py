@@ -29,6 +29,7 @@ class NFWPO(TD3):
     config_class = NFWPOConfig
     maps = (Project,)
     placements = ("rollout",)
+    takes_penalty = False
     paper = {
         "Reacher": TD3.paper["Reacher"] | {"fw_learning_rate": 0.05},
         "Hopper": TD3.paper["Hopper"] | {"fw_learning_rate": 0.01},

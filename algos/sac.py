@@ -107,6 +107,7 @@ class SAC(Agent):
     family = "SAC"
     placements = ("environment", "layer")
     needs_log_prob = True
+    takes_penalty = True
     paper = {
         "Reacher": {
             "gamma": 0.98, "hidden": [400, 300], "batch_size": 256, "learning_rate": 7.3e-4,

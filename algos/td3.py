@@ -36,6 +36,7 @@ class TD3(Agent):
     config: TD3Config
     config_class = TD3Config
     family = "TD3"
+    takes_penalty = True
     paper = {
         "Reacher": {
             "gamma": 0.98, "hidden": [400, 300], "batch_size": 100, "learning_rate": 1e-3,

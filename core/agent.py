@@ -22,6 +22,7 @@ from core.snapshot import Snapshots, parameters_of
 class Action(NamedTuple):
     """Actions (seeds, d) on the CPU."""
 
+    suggested: Tensor  # before any clamp or map
     executed: Tensor  # what the robot does
     stored: Tensor  # what the replay buffer keeps and the critic learns from
 
@@ -53,11 +54,20 @@ class Agent(Snapshots):
     """Where its map can stand."""
     needs_log_prob: ClassVar[bool] = False
     """Whether it needs the log-density of the action that the critic sees."""
+    takes_penalty: ClassVar[bool] = False
+    """Whether its actor loss can have the term `penalty`, as in the names with +."""
 
     @classmethod
-    def check_combination(cls, map: Map, placement: Placement) -> None:
-        """Raise ValueError, with the reason, where the algorithm is not implemented for this map in this place."""
+    def check_combination(cls, map: Map, placement: Placement, penalty: bool) -> None:
+        """Raise ValueError, with the reason, where the algorithm is not implemented for this row of the table."""
         name, map_name = cls.__name__, type(map).__name__
+        missing = [*sorted(cls.__abstractmethods__), *(a for a in ("family", "paper") if not hasattr(cls, a))]
+        if missing:
+            raise ValueError(f"{name} is not complete: it does not define {', '.join(missing)}")
+        if "Others" not in cls.paper:
+            raise ValueError(f"{name}.paper has no 'Others', the settings of robots without a group of their own")
+        if isinstance(map, type):
+            raise ValueError(f"map must be an object such as {map.__name__}(), got the class")
         if placement not in get_args(Placement):
             raise ValueError(f"unknown placement {placement!r} (choices: {', '.join(get_args(Placement))})")
         if not isinstance(map, cls.maps):
@@ -71,6 +81,8 @@ class Agent(Snapshots):
             )
         if cls.needs_log_prob and placement != "environment" and not map.has_log_prob():
             raise ValueError(f"{name} needs the log-density of mapped actions, and {map_name} has no with_log_prob")
+        if penalty and not cls.takes_penalty:
+            raise ValueError(f"{name} takes no penalty: its actor loss does not use it")
 
     def __init__(
         self,
@@ -92,7 +104,7 @@ class Agent(Snapshots):
         self.device = torch.device(config.device)  # of networks, batches and what `explore` and `policy` are given
         self.exploration = Streams(seeds, "explore", self.device)
         self.update_noise = Streams(seeds, "update", self.device)
-        self.updates = 0  # gradient steps so far, where an algorithm counts them
+        self.updates = 0  # gradient steps so far, where an algorithm counts them (see `cycle`)
         self.losses: dict[str, Tensor] = {}  # (..., seeds) of the last step of each optimiser
         self.build(Streams(seeds, "init").generators)
 
@@ -126,7 +138,11 @@ class Agent(Snapshots):
 
     @property
     def cycle(self) -> int:
-        """The number of gradient steps after which the same kind of step comes again."""
+        """The number of gradient steps after which the same kind of step comes again.
+
+        On a GPU, one CUDA graph is captured for each residue of `self.updates` modulo `cycle`. An algorithm whose steps
+        differ, as TD3's with and without the actor, counts `self.updates` in `update` and overrides this.
+        """
         return 1
 
     # ---------------------------------------------------------------- acting
@@ -137,12 +153,13 @@ class Agent(Snapshots):
 
         obs (seeds, n) and `center` (seeds, d), from `centers`, are on the CPU. Other rows of the actions are junk.
         """
-        suggested = torch.zeros(len(self.seeds), self.action_dim)
+        raw = torch.zeros(len(self.seeds), self.action_dim)
         if warming_up:
-            suggested[warming_up] = self.warm_up(warming_up)[warming_up].cpu()
+            raw[warming_up] = self.warm_up(warming_up)[warming_up].cpu()
         if exploring:
-            explored = self.explore(obs.to(self.device), exploring)[exploring].cpu()
-            suggested[exploring] = explored.clamp(-1.0, 1.0) if self.map.squashes else explored
+            raw[exploring] = self.explore(obs.to(self.device), exploring)[exploring].cpu()
+        suggested = raw.clamp(-1.0, 1.0) if self.map.squashes else raw
+        if exploring:
             executed = self.feasible(obs, suggested, center)
         if warming_up:
             pulled_back = self.map.pull_back(self.constraint, obs, suggested, center)
@@ -150,7 +167,7 @@ class Agent(Snapshots):
                 executed[warming_up] = pulled_back[warming_up]
             else:
                 executed = pulled_back
-        return Action(executed, suggested if self.placement == "environment" else executed)
+        return Action(raw, executed, suggested if self.placement == "environment" else executed)
 
     def centers(self, obs: Tensor) -> Tensor | None:
         """The centres (..., d) of the sets at obs (..., n), None where the map needs none but the origin."""
@@ -171,17 +188,28 @@ class Agent(Snapshots):
     # ---------------------------------------------------------------- learning
 
     def penalty(self, obs: Tensor, suggested: Tensor) -> Tensor | float:
-        """The + variants' term of the actor loss (seeds, batch), zero for the others (paper, "Algorithms")."""
+        """The term that names with + add to the actor loss (seeds, batch), zero for other names (paper, "Algorithms").
+
+        An algorithm that uses it sets `takes_penalty`.
+        """
         weight = self.penalty_weight
         return 0.0 if weight is None else weight * self.constraint.penalty(obs, suggested)
 
     def descend(self, name: str, losses: Tensor) -> None:
         """One step of the optimiser `name` on the sum of `losses` (..., seeds), which `diverged` looks at.
 
-        Gradients are for the optimiser's own parameters alone.
+        Gradients are for the optimiser's own parameters alone. Raises ValueError for an unknown name, and for losses
+        whose last axis is not that of the seeds: their gradients would depend on the number of seeds.
         """
+        optimizers = self.optimizers()
+        if name not in optimizers:
+            raise ValueError(f"there is no optimiser {name!r} (choices: {', '.join(optimizers)})")
+        if losses.shape[-1:] != (len(self.seeds),):
+            raise ValueError(
+                f"losses of {name!r} have shape {tuple(losses.shape)}, expected (..., seeds) = (..., {len(self.seeds)})"
+            )
         self.losses[name] = losses.detach()
-        optimizer = self.optimizers()[name]
+        optimizer = optimizers[name]
         parameters = parameters_of(optimizer)
         for parameter, gradient in zip(parameters, torch.autograd.grad(losses.sum(), parameters), strict=True):
             parameter.grad = gradient

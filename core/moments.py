@@ -48,9 +48,10 @@ class Moments:
 
     def restore(self, checkpoints: Sequence[Checkpoint], obs: Tensor, center: Tensor | None) -> None:
         """Go back to the moment of `checkpoints`, one of each seed; obs and `center` receive those of that moment."""
-        for seed, checkpoint in zip(self.seeds, checkpoints, strict=True):
-            i, state = seed.position, checkpoint.state()
-            seed.restore(state)
+        states = [checkpoint.state() for checkpoint in checkpoints]
+        # Everything is read before anything is written. A read error thus leaves every folder as it is.
+        for seed, checkpoint, state in zip(self.seeds, checkpoints, states, strict=True):
+            i = seed.position
             obs[i] = state["obs"]
             if center is not None:
                 center[i] = state["center"]
@@ -59,8 +60,10 @@ class Moments:
             self.replay.added[i] = state["added"]
             self.replay.streams.generators[i].set_state(state["sampling"])
             checkpoint.fill(*self._stored(seed))
+        for seed, checkpoint, state in zip(self.seeds, checkpoints, states, strict=True):
+            seed.restore(state)
             seed.checkpoints.resume(checkpoint)
-        self.timer.restore(state["seconds"])
+        self.timer.restore(states[-1]["seconds"])
 
     def _state(self, seed: Seed, obs: Tensor, center: Tensor | None) -> dict[str, Any]:
         """Everything about a seed but its transitions."""

@@ -33,7 +33,7 @@ class Network(nn.Module):
 
     @cached_property
     def parameter_list(self) -> list[Tensor]:
-        """What `parameters()` yields; that walk through the modules takes longer than updating a target."""
+        """The parameters as a list. Collecting them anew takes longer than updating a target network."""
         return [*self.parameters()]
 
 

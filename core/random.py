@@ -48,7 +48,8 @@ class Tape:
 class Streams:
     """One generator a seed for one purpose. A draw stacks what each seed alone would have drawn.
 
-    Numbers are drawn on the CPU and then moved to the `device`.
+    Numbers are drawn on the CPU and then moved to the `device`. An algorithm uses `normal` and `uniform`; `indices` is
+    for the replay buffer.
     """
 
     def __init__(self, seeds: Sequence[int], purpose: str, device: torch.device | str = "cpu"):

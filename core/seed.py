@@ -51,7 +51,7 @@ class Seed:
         return self.result is not None or self.failure is not None
 
     def count_step(self, config: Config, episode_over: bool) -> bool:
-        """Count an environment step. Whether a rollout ends with it that no gradient steps follow."""
+        """Count an environment step. Return True if a rollout ends here and no gradient steps follow it."""
         self.steps += 1
         self.rollout_steps += 1
         if not (episode_over if config.train_freq == "episode" else self.rollout_steps == config.train_freq):

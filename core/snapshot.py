@@ -1,4 +1,4 @@
-"""One seed's share of an agent's tensors: copied, put back, cleared and checked."""
+"""The half of `core.agent.Agent` that handles one seed's share of its tensors: copying, restoring, clearing, checks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ class Snapshots(ABC):
 
     @abstractmethod
     def networks(self) -> dict[str, nn.Module]:
-        """The learned modules; each parameter's leading axis holds the seeds, once or (twin critics) twice."""
+        """The learned modules by name.
+
+        Each parameter's leading axis has k rows a seed: first those of all seeds in order, then the second of all
+        seeds, and so on. k is 1 for most modules and 2 for `core.networks.TwinCritic`; any k works.
+        """
 
     @abstractmethod
     def optimizers(self) -> dict[str, Optimizer]:
@@ -32,7 +36,10 @@ class Snapshots(ABC):
         """The random streams by name."""
 
     def memory(self) -> dict[str, Tensor]:
-        """Tensors (seeds, ...) that the future depends on, beside networks, optimisers and random streams."""
+        """Tensors (seeds, ...) that the future depends on, beside networks, optimisers and random streams.
+
+        Return the tensors themselves, not copies: resuming writes into them.
+        """
         return {}
 
     @torch.no_grad()
@@ -48,7 +55,7 @@ class Snapshots(ABC):
 
     @torch.no_grad()
     def training_state(self, i: int) -> dict[str, Any]:
-        """A copy, on the CPU, of all that seed i needs to train on exactly as it would have."""
+        """A CPU copy of everything that seed i needs to continue with the same bits."""
         optimizers = {}
         for name, optimizer in self.optimizers().items():
             for number, parameter in enumerate(parameters_of(optimizer)):
@@ -107,7 +114,7 @@ class Snapshots(ABC):
                 yield f"{module_name}.{name}", parameter
 
     def _rows(self, tensor: Tensor) -> Tensor:
-        """View (1 or 2, seeds, ...) of a parameter, or of a tensor of its shape."""
+        """View (k, seeds, ...) of a parameter with k rows a seed, or of a tensor of its shape."""
         return tensor.view(-1, len(self.seeds), *tensor.shape[1:])
 
 

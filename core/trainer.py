@@ -157,7 +157,7 @@ class Trainer:
         reward, terminated, ended = (np.zeros((len(self.seeds), 1), dtype=np.float32) for _ in range(3))
         with self.timer.timed("environment"):
             stepped = []
-            for seed, outcome in self._outcomes(seeds, action.executed.numpy(), action.stored.numpy()):
+            for seed, outcome in self._outcomes(seeds, action.suggested.numpy(), action.executed.numpy()):
                 i = seed.position
                 obs, reward[i], terminated[i], truncated, _ = outcome
                 if not (np.isfinite(obs).all() and np.isfinite(reward[i])):
@@ -187,15 +187,15 @@ class Trainer:
         if new_rollout:
             self.agent.start_rollout(new_rollout)
 
-    def _outcomes(self, seeds: Sequence[Seed], executed: np.ndarray, stored: np.ndarray) -> list[tuple[Seed, tuple]]:
+    def _outcomes(self, seeds: Sequence[Seed], suggested: np.ndarray, executed: np.ndarray) -> list[tuple[Seed, tuple]]:
         """Step the environments of `seeds`: what `step` returned, without the seeds whose action was not executed."""
-        finite = np.isfinite(stored).all(-1)
+        finite = np.isfinite(suggested).all(-1)
         sound = []
         for seed in seeds:
             if finite[seed.position]:
                 sound.append(seed)
             else:
-                self._fail(seed, f"action {stored[seed.position].tolist()} is not finite")
+                self._fail(seed, f"suggested action {suggested[seed.position].tolist()} is not finite")
         outcomes = self.step_together([seed.env for seed in sound], executed[[seed.position for seed in sound]])
         taken = []
         for seed, outcome in zip(sound, outcomes, strict=True):

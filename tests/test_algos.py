@@ -256,6 +256,18 @@ def test_the_batch_leaves_no_case_out():
         assert (first < second).any() and (first > second).any()
 
 
+def test_a_step_on_losses_of_another_shape_or_of_an_unknown_optimiser_is_refused():
+    agent, batch = make_agent("DPre"), make_batch()
+    q = agent.critic(batch.obs, batch.action)
+    for losses, shape in ((q.mean(), "()"), (q, f"(2, 2, {BATCH})"), (q.mean((0, 2))[:1], "(1,)")):
+        with pytest.raises(ValueError) as error:
+            agent.descend("critic", losses)
+        wanted = f"losses of 'critic' have shape {shape}, expected (..., seeds) = (..., 2)"
+        assert str(error.value) == wanted and agent.losses == {}
+    with pytest.raises(ValueError, match=r"^there is no optimiser 'critics' \(choices: actor, critic\)$"):
+        agent.descend("critics", q.mean(-1))
+
+
 # ---------------------------------------------------------------- targets, delays, soft updates
 
 

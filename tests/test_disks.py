@@ -7,6 +7,7 @@ import pytest
 from helpers import CHECKPOINTED, Breaks, assert_identical, break_off, outcome, run_command, train
 
 from store import folder as results
+from store.checkpoint import Checkpoint, CheckpointFolder
 
 
 def no_space(*_):
@@ -69,6 +70,32 @@ def test_after_a_checkpoint_that_did_not_fit_the_one_before_is_whole(tmp_path, m
     with pytest.raises(ZeroDivisionError):
         train(tmp_path, CHECKPOINTED, fill_disk)
     monkeypatch.undo()
+    train(tmp_path, CHECKPOINTED)
+    assert_identical(outcome(tmp_path), unbroken)
+
+
+def test_transitions_that_cannot_be_read_leave_the_run_as_it_is(tmp_path, monkeypatch, unbroken):
+    """Tables and parameters go back to the checkpoint only after the transitions of every seed are in memory."""
+
+    def unreadable(checkpoint, *args):
+        if "seed=5" in str(checkpoint.path):
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(checkpoint.path))
+        fill(checkpoint, *args)
+
+    def left():
+        names = ("evaluations.csv", "best.pt", "checkpoint/state-3.pt")
+        return {path: (path.read_bytes(), path.stat().st_mtime_ns) for f in folders for path in map(f.joinpath, names)}
+
+    folders, fill = break_off(tmp_path, calls=200), Checkpoint.fill
+    before = left()
+    for folder in folders:  # it has an evaluation more than its checkpoint
+        (newest, _), _ = CheckpointFolder(folder).read()
+        tables = newest.state()["tables"]
+        assert tables["evaluations.csv"].count("\n") < (folder / "evaluations.csv").read_text().count("\n")
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoint, "fill", unreadable)
+        assert run_command([*CHECKPOINTED.split(), f"results={tmp_path}"]) == 2
+    assert left() == before
     train(tmp_path, CHECKPOINTED)
     assert_identical(outcome(tmp_path), unbroken)
 

@@ -152,20 +152,22 @@ def test_a_parameter_that_no_loss_shows_is_found_before_it_is_evaluated(tmp_path
     assert failure["step"] == 120 and failure["last_evaluation"]["step"] == 60
 
 
-@pytest.mark.parametrize("algo", ["DRad", "DPre"])
-def test_an_action_that_is_not_finite(tmp_path, monkeypatch, algo):
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("algo", ["DRad", "DPre", "DPro"])
+def test_a_suggested_action_that_is_not_finite(tmp_path, monkeypatch, algo, value):
+    """An infinite one too, even where a clamp would make it finite."""
     explore = ALGORITHMS[algo].agent.explore
 
     def spoiled(self, obs, which):
         suggested = explore(self, obs, which)
         if self.updates == MOMENT:
-            suggested[BAD] = math.nan
+            suggested[BAD] = value
         return suggested
 
     monkeypatch.setattr(ALGORITHMS[algo].agent, "explore", spoiled)
     assert run_command([*f"algo={algo} env=R+L2 {WORDS}".split(), f"results={tmp_path}"]) == 3
     ((name, failure),) = failures(tmp_path).items()
-    assert name == "seed=5" and failure["quantity"] == "action [nan, nan] is not finite"
+    assert name == "seed=5" and failure["quantity"] == f"suggested action [{value}, {value}] is not finite"
 
 
 def test_a_seed_that_fails_at_its_first_step(tmp_path, monkeypatch):
@@ -182,6 +184,7 @@ def test_a_seed_that_fails_at_its_first_step(tmp_path, monkeypatch):
     assert run_command([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
     ((name, failure),) = failures(tmp_path / "spoiled").items()
     assert name == "seed=5" and (failure["step"], failure["executed_actions"]) == (0, 0)
+    assert failure["quantity"] == "suggested action [inf, inf] is not finite"
     assert failure["last_evaluation"] is None and failure["largest_violation"] is None
     assert json.loads(json.dumps(failure)) == failure
     sound = outcome(tmp_path / "sound")

@@ -16,6 +16,7 @@ from core.agent import Agent
 from core.config import NOT_NEGATIVE, Config, keys_of, resolve, saved_settings, setting
 from core.maps import Alpha, Gauge, Map, Project, Radial, Sample
 from core.networks import MLP, Adam, frozen_copy, rows_of, soft_update
+from core.replay import Batch, Replay
 from core.words import ConfigError, split_names
 from envs import TASKS
 from plots.definitions import hyperparameter_table
@@ -141,12 +142,41 @@ def test_the_entropy_in_unit_ball_coordinates_is_a_setting_of_the_map():
         (TD3, Project(), "wrapper", "unknown placement 'wrapper'"),
         (NFWPO, Project(), "layer", "NFWPO is implemented for placement rollout, not layer"),
         (NFWPO, Radial(), "rollout", "NFWPO is implemented for Project, not Radial"),
+        (TD3, Bare, "layer", "map must be an object such as Bare(), got the class"),
+        (TD3, "Alpha", "layer", "TD3 is implemented for Map, not str"),
     ],
 )
 def test_a_combination_that_is_not_implemented_is_refused_with_the_reason(agent, map, placement, reason):
     with pytest.raises(ValueError) as error:
         Algorithm(agent, map, placement)
     assert reason in str(error.value)
+
+
+def test_a_penalty_that_the_actor_loss_does_not_use_is_refused():
+    class Blind(DDPG):
+        takes_penalty = False
+
+    assert not Agent.takes_penalty
+    for agent, placement in ((NFWPO, "rollout"), (Blind, "layer")):
+        Algorithm(agent, Project(), placement)
+        with pytest.raises(ValueError, match=f"^{agent.__name__} takes no penalty: its actor loss does not use it$"):
+            Algorithm(agent, Project(), placement, penalty=True)
+
+
+def test_an_agent_that_is_not_complete_is_refused_with_what_is_missing():
+    class Half(Agent):
+        def build(self, init):
+            pass
+
+    class Nameless(DDPG):
+        paper = {"Reacher": {}}
+
+    with pytest.raises(ValueError) as error:
+        Algorithm(Half, Project(), "layer")
+    missing = "explore, networks, optimizers, policy, update, family, paper"
+    assert str(error.value) == f"Half is not complete: it does not define {missing}"
+    with pytest.raises(ValueError, match="^Nameless.paper has no 'Others'"):
+        Algorithm(Nameless, Project(), "layer")
 
 
 def test_what_is_accepted_is_what_the_table_has_and_no_more():
@@ -196,12 +226,21 @@ def test_centres_are_computed_once_and_replayed(monkeypatch):
         return original(self, obs)
 
     original = WeightedPositivePart.center
-    agent = sac(Soft())
-    obs = torch.randn(1, 4, OBS)
+    agent, steps = sac(Soft()), 5
+    replay = Replay([0], steps, OBS, DIM, agent.stores_centers)
     monkeypatch.setattr(WeightedPositivePart, "center", center)
-    centers = agent.centers(obs)
-    agent.sample(obs, centers, torch.zeros(1, 4, DIM))
-    assert calls == [obs.shape] and agent.stores_centers
+    obs = torch.randn(steps + 1, 1, OBS, generator=torch.Generator().manual_seed(0))
+    now = agent.centers(obs[0])
+    for t in range(steps):
+        action = agent.act(obs[t], now, [], [0])
+        then = agent.centers(obs[t + 1])
+        zero = torch.zeros(1, 1)
+        replay.add([0], Batch(obs[t], action.stored, zero, zero, obs[t + 1], now, then))
+        now = then
+        agent.update(batch := replay.sample(4))
+    assert agent.stores_centers and calls == [(1, OBS)] * (steps + 1)  # one an observation
+    torch.testing.assert_close(batch.center, original(CONSTRAINT, batch.obs))
+    torch.testing.assert_close(batch.next_center, original(CONSTRAINT, batch.next_obs))
     assert not Algorithm(TD3, Project(), "layer").map.replays_center(CONSTRAINT)
     assert not Soft().replays_center(TASKS["HC+O"].constraint)  # its centre is the origin
 
@@ -218,6 +257,49 @@ def test_the_settings_of_a_map_are_keys_of_its_algorithms(monkeypatch):
     # A setting that only densities use is none of TD3's.
     assert "entropy" not in keys_of(ALGORITHMS["DAlpha"].config_class)
     assert {"entropy", "boundary_weight"} <= keys_of(ALGORITHMS["SAlpha"].config_class).keys()
+
+
+def test_a_setting_that_cannot_be_a_key_is_refused():
+    @dataclass
+    class Slow(Soft):
+        tau: float = setting(0.7, "how slow")
+
+    @dataclass
+    class Dense(Soft):
+        gsde: bool = setting(False, "not on the command line of TD3", of_density=True)
+
+    @dataclass
+    class Seeded(Soft):
+        seed: int = setting(0, "its name is the key of another field")
+
+    @dataclass
+    class Weighted(Soft):
+        penalty: float = setting(2.0, "only the names with + have this setting already")
+
+    @dataclass
+    class Plain(Soft):
+        scale: float = 1.0
+
+    @dataclass
+    class PlainConfig(DDPGConfig):
+        rate: float = 1.0
+
+    class PlainDDPG(DDPG):
+        config_class = PlainConfig
+
+    Algorithm(TD3, Dense(), "layer")
+    Algorithm(TD3, Weighted(), "layer")
+    for agent, map, penalty, reason in (
+        (TD3, Slow(), False, "Slow.tau has the name of a setting of TD3"),
+        (SAC, Dense(), False, "Dense.gsde has the name of a setting of SAC"),
+        (TD3, Seeded(), False, "Seeded.seed has the name of a setting of TD3"),
+        (TD3, Weighted(), True, "Weighted.penalty has the name of a setting of TD3"),
+        (TD3, Plain(), False, "Plain.scale must be made with core.config.setting"),
+        (PlainDDPG, Soft(), False, "PlainConfig.rate must be made with core.config.setting"),
+    ):
+        with pytest.raises(ValueError) as error:
+            Algorithm(agent, map, "layer", penalty)
+        assert str(error.value) == reason
 
 
 # ---------------------------------------------------------------- settings
@@ -258,6 +340,7 @@ class DDPG(Agent):
     family = "DDPG"
     paper = {"Others": {"gamma": 0.98, "tau": 0.05}}
     placements = ("layer",)
+    takes_penalty = True
 
     def build(self, init):
         self.actor = MLP([self.obs_dim, *self.config.hidden, self.action_dim], init).to(self.device)

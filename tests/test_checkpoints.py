@@ -184,7 +184,11 @@ def test_settings_that_changed_are_not_mixed(tmp_path, capsys, monkeypatch):
     capsys.readouterr()
     assert run_command([*CHECKPOINTED.split(), f"results={tmp_path}"]) == 2
     err = capsys.readouterr().err
-    assert f"{folder} started with tau=0.005, but this command has tau=0.5; use" in err and "overwrite=true" in err and err.count("\n") == 1
+    assert (
+        f"{folder} started with tau=0.005, but this command has tau=0.5; use" in err
+        and "overwrite=true" in err
+        and err.count("\n") == 1
+    )
     assert run_command([*CHECKPOINTED.split(), f"results={tmp_path}", "overwrite=true"]) == 0
     assert (folder.parent / "seed=3.old-1" / "checkpoint").is_dir() and (folder / "result.json").is_file()
 

@@ -46,9 +46,9 @@ class Pass:
     """A batch going through networks side by side, one a row."""
 
     network: str
-    """Whose weights."""
+    """The network that owns the weights."""
     inputs: str
-    """What goes through, for the names of its matrices."""
+    """The input, which names the matrix products."""
     rows: int
     batch: int
     widths: Sequence[int]

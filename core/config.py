@@ -27,7 +27,7 @@ the networks are small."""
 
 
 class Rule(NamedTuple):
-    """What the value of a setting must satisfy, and the words that say so."""
+    """The condition that a setting's value must meet, and its error message."""
 
     holds: Callable[[Any], bool]
     words: str

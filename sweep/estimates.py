@@ -119,7 +119,7 @@ def corrections(runs: Iterable[Run], device: str) -> dict[tuple[str, str], float
 
 
 def correct(corrections: Mapping[tuple[str, str], float], task: str, algo: str) -> float:
-    """The factor for a cell: that of its own runs, else that of all."""
+    """The correction from the cell's own finished runs; without any, the median over all cells."""
     return corrections.get((task, algo), corrections.get(("", ""), 1.0))
 
 

@@ -335,8 +335,9 @@ def test_cells_that_others_have_are_left_out(tmp_path, monkeypatch, capsys):
         assert run_command([*words, *more]) == 2
         captured = capsys.readouterr()
         assert "1 of 1 cells done" in captured.out and "failed" not in captured.err
-        (line,) = [line for line in captured.err.splitlines() if "left out" in line]
-        assert line.startswith("2 cells skipped because another process or job trains them") and (": job 7" in line or "on elsewhere" in line)
+        (line,) = [line for line in captured.err.splitlines() if "skipped" in line]
+        assert line.startswith("2 cells skipped because another process or job trains them")
+        assert "is queued: job 7" in line or "on elsewhere" in line
         assert not cells["SRad"].record("log").exists() and not cells["NFW"].record("log").exists()
 
 

@@ -63,6 +63,7 @@ def test_a_program_of_ones_own_that_trains_ends_with_a_checkpoint_too(tmp_path, 
 def test_a_first_ctrl_c_ends_a_command_that_does_not_train():
     done = script(
         "import os, signal, time, run\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell may have started us with it ignored
         "def describe(words):\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
         "    time.sleep(5)\n"

@@ -25,7 +25,7 @@ from sweep.status import find_cells
 ROOT = Path(__file__).parents[1]
 CELLS = "algo=DPre,SRad,NFW,DAlpha,SPre+ env=R+N seed=3,5"
 WORDS = (
-    f"{CELLS} steps=1500 learning_starts=100 batch_size=4 hidden=[8,8] eval_every=500 eval_episodes=1"
+    f"{CELLS} steps=6000 learning_starts=100 batch_size=4 hidden=[8,8] eval_every=2000 eval_episodes=1"
     " final_episodes=1 checkpoint_every=50 train_freq=1 gradient_steps=1"
 )
 # Slurm looks at time limits twice a minute, and may send the signal half a minute early.

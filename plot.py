@@ -167,6 +167,10 @@ def run(arguments: Sequence[str]) -> list[Path]:
     return COMMANDS[words[0]](words[1:], options)
 
 
+NAMED = 4
+"""The most files of a folder that the last lines name."""
+
+
 def main(arguments: Sequence[str]) -> int:
     """Exit code: 0 done, 2 bad input."""
     if not arguments or "--help" in arguments or "-h" in arguments:
@@ -178,7 +182,8 @@ def main(arguments: Sequence[str]) -> int:
         print(f"plot.py: {error}", file=sys.stderr)
         return 2
     for folder, count in Counter(path.parent for path in written).items():
-        print(f"{count} file{'s' * (count > 1)} in {folder}")
+        names = [path.name for path in written if path.parent == folder] if count <= NAMED else []
+        print(f"{count} file{'s' * (count > 1)} in {folder}{': ' * bool(names)}{', '.join(names)}")
     return 0
 
 

@@ -46,12 +46,12 @@ class PyBulletReacher(Robot):
             with _silent_import():
                 import pybullet
                 import pybullet_data
-        except ImportError as error:
+        except ImportError:
             python = f"{sys.version_info.major}.{sys.version_info.minor}"
             raise UnavailableError(
                 "simulator 'pybullet' needs the package pybullet, which has wheels for Linux on x86-64 with Python up"
                 f" to 3.11 (this is Python {python}); the default simulator gives the same joint angles in every bit"
-            ) from error
+            ) from None
         self._bullet = bullet = pybullet
         self._client = client = bullet.connect(bullet.DIRECT)
         if client < 0:

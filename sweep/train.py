@@ -203,7 +203,7 @@ def _resume(
     if len(seeds) < len(before):
         print(f"(trained with other seeds before, {len(before)} in all: equal up to rounding to an unbroken run)")
     if (threads := group[seeds[0]].settings["threads"]) != config.threads:
-        print(f"(trained with threads={threads} before: equal up to rounding to an unbroken run)")
+        print(f"(threads={config.threads} now, {threads} before: equal up to rounding to an unbroken run)")
     trainer = make_trainer(config, seeds, writers, True, stop_if_asked)
     trainer.restore([group[seed] for seed in seeds])
     _run(trainer)

@@ -122,4 +122,4 @@ def test_a_resumed_run_tells_that_its_threads_have_changed(tmp_path):
     said = [process.stdout.readline() for _ in range(2)]
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 143
-    assert "resuming from step" in said[0] and "trained with threads=2 before: equal up to rounding" in said[1]
+    assert "resuming from step" in said[0] and "threads=1 now, 2 before: equal up to rounding" in said[1]

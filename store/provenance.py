@@ -13,12 +13,15 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-_PACKAGES = ("torch", "numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omegaconf")
+import torch
+
+_PACKAGES = ("numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omegaconf")
 
 
 def describe_environment(command: Sequence[str]) -> dict[str, Any]:
     """The content of `info.json`: versions, git commit, command, start time. It names no path of this machine."""
-    versions: dict[str, str | None] = {"python": platform.python_version()}
+    # PyTorch itself names its build (+cpu, +cu130), which the metadata of a package may leave out.
+    versions: dict[str, str | None] = {"python": platform.python_version(), "torch": torch.__version__}
     for package in _PACKAGES:
         try:
             versions[package] = metadata.version(package)

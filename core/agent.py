@@ -33,7 +33,7 @@ class Agent(Snapshots):
     The actor *suggests* an action and the feasibility map turns it into the *executed* one. `placement` says where
     the map stands (paper, Section "Algorithms for Action-Constrained RL"):
 
-    - `environment`: beyond the border of the environment; critic and replay buffer see the suggested action;
+    - `environment`: inside the environment; critic and replay buffer see the suggested action;
     - `rollout`: between actor and environment; critic and buffer see the executed action, but the actor's loss is
       blind to the map;
     - `layer`: the last layer of the actor; critic and buffer see the executed action, gradients pass the map.
@@ -151,7 +151,7 @@ class Agent(Snapshots):
     def act(self, obs: Tensor, center: Tensor | None, warming_up: Sequence[int], exploring: Sequence[int]) -> Action:
         """Actions of the seeds `warming_up`, random ones, and of those `exploring`, the actor's with noise.
 
-        obs (seeds, n) and `center` (seeds, d), from `centers`, are on the CPU. Other rows of the actions are junk.
+        obs (seeds, n) and `center` (seeds, d), from `centers`, are on the CPU. Ignore the other rows of the actions.
         """
         raw = torch.zeros(len(self.seeds), self.action_dim)
         if warming_up:

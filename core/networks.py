@@ -47,7 +47,7 @@ class MLP(Network):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """An input of fewer rows goes through the first of them."""
+        """If `x` has fewer rows than the network, only the first rows of the weights are used."""
         # On a small network Python and PyTorch's dispatch cost as much as the arithmetic, hence no calls of modules.
         rows, last = x.shape[0], len(self.layers) - 1
         for number, layer in enumerate(cast("Iterable[Linear]", self.layers)):

@@ -86,7 +86,7 @@ class _Locomotion(Robot):
         return state
 
     def set_state(self, state: np.ndarray) -> np.ndarray:
-        """Take up `state` (k,) from `get_state`; return the observation."""
+        """Continue from `state` (k,), which `get_state` returned; return the observation."""
         self._mujoco.mj_resetData(self.model, self.data)
         self._mujoco.mj_setState(self.model, self.data, state, self._mujoco.mjtState.mjSTATE_INTEGRATION)
         # Positions of the bodies, for a picture; the next step computes everything else.

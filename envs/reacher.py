@@ -116,7 +116,7 @@ def _accelerate(
     fx = (_MASS * vx * fore_drag - _MASS * (w * fore_speed)) + tip_fx
     moment = (_INERTIA * w * fore_spin_drag + (_TIP_INERTIA * w * fore_spin_drag + _TIP * tip_fy)) + HALF * fy
 
-    # What joint 1 cannot take up acts on the upper arm: force (px, py) and moment about its centre.
+    # The rest of the forearm's load acts on the upper arm: force (px, py) and moment about its centre.
     coriolis = vx * w2
     y2 = (moment - t2) - _FORE_MOMENT * coriolis
     z = y2 * _INVERSE_FORE_INERTIA
@@ -303,7 +303,7 @@ class Reacher(Robot):
         return np.array(self.state)
 
     def set_state(self, state: np.ndarray) -> np.ndarray:
-        """Take up `state` (8,) from `get_state`; return the observation (9,)."""
+        """Continue from `state` (8,), which `get_state` returned; return the observation (9,)."""
         self.state = State(*state.tolist())
         return np.array(self.state.observation(FLOATS))
 

@@ -60,7 +60,7 @@ class Robot(ABC):
         return None
 
     def set_state(self, state: np.ndarray) -> np.ndarray:
-        """Take up a state (k,) that `get_state` returned, also in another process; return its observation."""
+        """Continue from `state` (k,), which `get_state` returned, maybe in another process; return its observation."""
         raise TypeError(f"{type(self).__name__} has no state to set")
 
     @abstractmethod

@@ -80,7 +80,7 @@ def submit(sweep: Sweep, cells: Sequence[Cell]) -> None:
         with run_lock(folder.with_name("submission")):
             jobs = job_states(cells)
             if NO_ANSWER in jobs.values():
-                raise ConfigError("squeue does not answer, so nobody knows which cells are queued already")
+                raise ConfigError("squeue does not answer, so it is unknown which cells are queued already")
             entries = make_plan(cells, jobs)
             print(count_states([entry.state for entry in entries]))
             for entry in entries:

@@ -72,8 +72,8 @@ def final_gains(task: str, seed: int, evaluations: int, parallel: int, episodes:
 
 def adjusted_returns(run: Run) -> np.ndarray:
     """The adjusted returns (episodes,) of a finished run on Reacher."""
-    returns, parallel = np.array(run.result["returns"]), run.config["eval_episodes"]
-    return returns - final_gains(run.task, run.seed, len(run.evaluations.step), parallel, len(returns)) + mean_gain()
+    returns, (evaluations, parallel) = np.array(run.result["returns"]), run.evaluations.returns.shape
+    return returns - final_gains(run.task, run.seed, evaluations, parallel, len(returns)) + mean_gain()
 
 
 def is_on_reacher(run: Run) -> bool:

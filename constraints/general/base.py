@@ -7,7 +7,8 @@ from torch import Tensor
 
 from constraints.base import Constraint
 from constraints.errors import ConstraintError, name_samples, require
-from constraints.general.centers import chebyshev_centers, interior_points
+from constraints.general.active_set import project_on_rows
+from constraints.general.centers import deep_points, interior_points
 from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.projection import closest_points, optimal_points, projection_jacobian
 from constraints.general.scaled_sets import ScaledSets, scale_sets
@@ -51,12 +52,18 @@ class GeneralConstraint(Constraint):
         size = slope.abs().amax(-1, keepdim=True)
         finite = size.isfinite()
         slope = torch.where(finite & (size > 0.0), slope / size, 0.0)
-        solution = optimal_points(sets, slope, linear=True)[0] if sets.curved else maximize_on_rows(sets, slope)
+        if sets.curved:
+            solution = optimal_points(sets, slope, linear=True)[0]
+        else:
+            corner = sets.given_rows + torch.arange(self.dim) + self.dim * (slope < 0.0)
+            solution, _ = maximize_on_rows(sets.rows, sets.bounds, slope, corner, sets.name, sets.given_rows)
+            # The solution may leave the set by the linear program's rounding.
+            solution = project_on_rows(sets.rows, sets.bounds, solution, sets.name, sets.given_rows)[0]
         return torch.where(finite, solution, torch.nan).view(gradient.shape).to(gradient.device)
 
     def _center(self, obs: Tensor) -> Tensor:
         sets = self._scaled_sets(obs, obs.shape[:-1])
-        center = interior_points(sets) if sets.curved else chebyshev_centers(sets)
+        center = interior_points(sets) if sets.curved else deep_points(sets)
         return center.view(*obs.shape[:-1], self.dim).to(obs.device)
 
     def _scaled_sets(self, obs: Tensor, lead: tuple[int, ...]) -> ScaledSets:

@@ -15,8 +15,8 @@ class Intersection(GeneralConstraint):
 
     Each is a constraint of this package, a user's own with `explicit`, or another intersection; ValueError for none, or
     for different dimensions. `penalty` is the sum of their penalties, `violation` the largest violation. `center` is
-    the Chebyshev centre if all are linear. With an ellipse it is the origin where that is interior, otherwise the point
-    deepest in the set. Methods raise a ConstraintError as those of LinearConstraint and QuadraticConstraint do.
+    that of a LinearConstraint if all are linear. With an ellipse it is the origin where that is interior, otherwise the
+    point deepest in the set, and a mean of both where the origin is near the boundary. Methods raise a ConstraintError as those of LinearConstraint and QuadraticConstraint do.
     """
 
     def __init__(self, *constraints: Constraint):

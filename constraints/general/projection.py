@@ -30,8 +30,6 @@ _LAST_NEWTON_STEP = 1e-9
 _OUTSIDE = 1e-12
 # The most quadratic programs of one solution; 2 to 10 are enough in most cases.
 _MAX_PROGRAMS = 60
-# Steps of all samples below this end the programs: nothing moves any more.
-_AT_REST = 1e-14
 # The longest last step with which a sample counts as solved. Convergence is quadratic, so its error is rounding.
 _LAST_PROGRAM_STEP = 1e-9
 # The linear oracle as a projection: of a point this far along the slope. One step leaves the square of the error over
@@ -150,7 +148,7 @@ def _sequential_programs(sets: ScaledSets, target: Tensor, point: Tensor, multip
         step = torch.linalg.solve_triangular(root.mT, step.unsqueeze(-1), upper=True).squeeze(-1)
         point, multipliers = point + step, multipliers / norm
         length = step.abs().amax(-1)
-        if bool((length <= _AT_REST).all()):
+        if bool((length <= _LAST_PROGRAM_STEP).all()):
             break
     require(length <= _LAST_PROGRAM_STEP, "the closest point was not found", sets.name)
     return point, multipliers
@@ -163,14 +161,15 @@ def _hessian(sets: ScaledSets, multipliers: Tensor) -> Tensor:
 
 
 def _pull_towards(sets: ScaledSets, inside: Tensor, point: Tensor) -> Tensor:
-    """The point (n, d), moved towards the interior point `inside` where it leaves the set by rounding."""
+    """The point (n, d), moved towards the interior point `inside` where it leaves the set by more than `_OUTSIDE`."""
     # The excess is first order in the distance moved, and convexity makes the step an upper bound on what is needed.
     rows = times(sets.rows, point) - sets.bounds
     ellipses, value = sets.ellipse_values(point)[0], sets.ellipse_values(inside)[0]
     room = torch.cat((sets.bounds - times(sets.rows, inside), 1.0 - value), -1)
     excess = torch.cat((rows, ellipses - 1.0), -1).clamp(min=0.0)
-    share = torch.where(excess > 0.0, excess / (excess + room), 0.0).amax(-1, keepdim=True)
-    return torch.lerp(point, inside, share)
+    share = torch.where(excess > 0.0, excess / (excess + room), 0.0).amax(-1)
+    share = torch.where(sets.depth(point) < -_OUTSIDE, share, 0.0)
+    return torch.lerp(point, inside, share.unsqueeze(-1))
 
 
 # -------------------------------------------------------------------- Jacobian

@@ -16,7 +16,8 @@ class Intersection(GeneralConstraint):
     Each is a constraint of this package, a user's own with `explicit`, or another intersection; ValueError for none, or
     for different dimensions. `penalty` is the sum of their penalties, `violation` the largest violation. `center` is
     that of a LinearConstraint if all are linear. With an ellipse it is the origin where that is interior, otherwise the
-    point deepest in the set, and a mean of both where the origin is near the boundary. Methods raise a ConstraintError as those of LinearConstraint and QuadraticConstraint do.
+    point deepest in the set, and a mean of both where the origin is near the boundary. Methods raise a ConstraintError
+    as those of LinearConstraint and QuadraticConstraint do.
     """
 
     def __init__(self, *constraints: Constraint):

@@ -13,7 +13,7 @@ from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.projection import closest_points, optimal_points, projection_jacobian
 from constraints.general.scaled_sets import ScaledSets, scale_sets
 from constraints.jacobian import JacobianProduct
-from constraints.numerics import times
+from constraints.numerics import is_traced, times
 
 # A centre given for a gauge that is nearer than this to the boundary is on it, up to rounding.
 ON_BOUNDARY = 1e-12
@@ -67,7 +67,15 @@ class GeneralConstraint(Constraint):
         return center.view(*obs.shape[:-1], self.dim).to(obs.device)
 
     def _scaled_sets(self, obs: Tensor, lead: tuple[int, ...]) -> ScaledSets:
-        return scale_sets(self.explicit(obs), lead)
+        written = self.explicit(obs)
+        ellipses = [value for ellipse in written.ellipses for value in ellipse]
+        if is_traced(written.rows, written.bounds, *ellipses):
+            raise RuntimeError(
+                f"project, center and linear_oracle of {type(self).__name__} have no gradient with respect to the"
+                " observation or to learned coefficients, and no torch.func transforms; pass obs.detach(), or"
+                " coefficients without gradients"
+            )
+        return scale_sets(written, lead)
 
 
 def check_obs(obs: Tensor) -> None:
@@ -81,7 +89,7 @@ def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tens
 
     -1 in `shape` stands for any size; lead may be the observation's leading shape or one that broadcasts to it.
     """
-    values = torch.as_tensor(values, dtype=torch.float64, device=obs.device).detach()
+    values = torch.as_tensor(values, dtype=torch.float64, device=obs.device)
     lead = values.shape[: values.dim() - len(shape)]
     fits = len(values.shape) >= len(shape) and all(
         have == want or want == -1 for have, want in zip(values.shape[len(lead) :], shape, strict=True)

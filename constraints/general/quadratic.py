@@ -72,7 +72,7 @@ class QuadraticConstraint(GeneralConstraint):
         matrix = 0.5 * (matrix + matrix.mT)
         least = torch.linalg.eigvalsh(matrix)[..., 0]
         require((least >= -_ROUNDING * largest).flatten(), "Q(obs) is not positive semi-definite", name)
-        matrix = matrix + (-least).clamp(min=0.0)[..., None, None] * torch.eye(
+        matrix = matrix + (-least.detach()).clamp(min=0.0)[..., None, None] * torch.eye(
             self.dim, dtype=matrix.dtype, device=matrix.device
         )
         require((bound > 0.0).flatten(), "bound(obs) is not positive", name_samples(tuple(bound.shape)))

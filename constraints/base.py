@@ -4,24 +4,28 @@ A feasible set is `A(obs)`, convex, inside the action box [-1, 1]^d. Tensors may
 `obs (..., n)` and `action (..., d)` broadcast against each other. Inputs are float32 or float64 and results have the
 dtype of the action. The mathematics is float64 throughout: joint velocities reach 1e6, and feasibility holds to 1e-6.
 That costs little, because the time goes into the number of operations and not into their width.
+
+Gradients with respect to the action are closed forms. Gradients with respect to the observation, a centre and the
+parameters of learned coefficients exist as well; they take more time, and only where a tensor asks for them. Pass
+`obs.detach()` where they are not wanted.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from constraints.gauge import box_gauge_gradient, largest_gauge
+from constraints.implicit import Boundary, Solver, differentiable_projection, tensors_of
 from constraints.jacobian import JacobianProduct, with_jacobian
-from constraints.numerics import keep_nan, one_where_zero, with_gradient
+from constraints.numerics import is_traced, keep_nan, one_where_zero, with_gradient
 from constraints.ray import Ray
 
-Coefficients = Callable[[Tensor], Tensor]
-"""Maps observations (..., n) to a constraint's state-dependent coefficients (..., d) or (..., d, d)."""
+AT_FACE = 1.0 - 1e-9
+"""The box holds a coordinate of a projection that is at least this large: rounding may have moved it off the face."""
 
 
 class Ellipse(NamedTuple):
@@ -44,7 +48,7 @@ class Constraint(ABC):
     """A feasible set A(obs) inside the box [-1, 1]^dim. ValueError for dim < 1.
 
     A subclass implements the protected methods. They receive float64 tensors; `action` (or `direction`, `gradient`)
-    has the common leading shape already. `_project`, `_center` and `_linear_oracle` run without autograd.
+    has the common leading shape already. `at` is what `_at(obs)` returned: the observation, if that is not overridden.
     """
 
     origin_centered: bool = True
@@ -59,36 +63,58 @@ class Constraint(ABC):
 
     # ---------------------------------------------------------------- what a subclass gives
 
+    def _at(self, obs: Tensor) -> Any:
+        """The coefficients at `obs` (..., n), for the other protected methods, or the observation itself.
+
+        Coefficients are a NamedTuple of float64 tensors (..., k) and numbers.
+        """
+        return obs
+
     @abstractmethod
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
+    def _violation(self, at: Any, action: Tensor) -> Tensor:
         """Excess (...) over the constraint, the box left out."""
 
     @abstractmethod
-    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+    def _project(self, at: Any, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         """Closest feasible point (..., d) and the product with the projection's Jacobian there.
 
         A NaN in the action is a NaN in the point, at least in that coordinate. Otherwise a broken policy would become
         feasible unnoticed.
         """
 
+    def _boundaries(self, at: Any, point: Tensor) -> list[Boundary]:
+        """The surfaces, the box's left out, that can hold a projection which ends at `point` (..., d).
+
+        Gradients of projections with respect to the coefficients need them; RuntimeError where a set has none.
+        """
+        raise RuntimeError(
+            f"projections of {type(self).__name__} have no gradient with respect to the observation or to learned"
+            " coefficients; pass obs.detach(), or coefficients without gradients"
+        )
+
+    def _free(self, point: Tensor) -> Tensor:
+        """The coordinates (..., d) that are held neither by the box nor by a kink of the set at `point`."""
+        return point.abs() < AT_FACE
+
     @abstractmethod
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+    def _gauge_gradients(self, at: Any, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         """Gradients (..., d) of the gauges of the set's parts with respect to `direction`, the box left out.
 
-        They are differentiable in `direction`, and 0 where it is 0. `center` is None for the origin.
+        They are differentiable in `direction`, the centre and the coefficients, and 0 where `direction` is 0. `center`
+        is None for the origin.
         """
 
     @abstractmethod
-    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
+    def _linear_oracle(self, at: Any, gradient: Tensor) -> Tensor:
         """Feasible point (..., d) with the largest inner product with `gradient`."""
 
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
+    def _penalty(self, at: Any, action: Tensor) -> Tensor:
         """The paper's penalty (...), with finite gradients everywhere. A set with several rows overrides this."""
-        return self._violation(obs, action).clamp(min=0.0)
+        return self._violation(at, action).clamp(min=0.0)
 
-    def _center(self, obs: Tensor) -> Tensor:
-        """Interior point (..., d), or a single one (d,) for every obs."""
-        return obs.new_zeros(self.dim)
+    def _center(self, at: Any) -> Tensor | None:
+        """Interior point (..., d), or a single one (d,) for every obs; None for the origin."""
+        return None
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         """The set's rows and ellipses. A part of an `Intersection` must have them; TypeError where it does not."""
@@ -104,7 +130,7 @@ class Constraint(ABC):
         """
         obs64, action64 = self._broadcast(obs, action)
         box = action64.abs().amax(-1) - 1.0
-        return torch.maximum(box, self._violation(obs64, action64)).to(action.dtype)
+        return torch.maximum(box, self._violation(self._at(obs64), action64)).to(action.dtype)
 
     def penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         """Penalty (...) of the '+' algorithms on an action in the box (paper, "Algorithms").
@@ -113,13 +139,18 @@ class Constraint(ABC):
         where both are present.
         """
         obs64, action64 = self._broadcast(obs, action)
-        return self._penalty(obs64, action64).to(action.dtype)
+        return self._penalty(self._at(obs64), action64).to(action.dtype)
 
     def project(self, obs: Tensor, action: Tensor) -> Tensor:
         """Closest feasible point (..., d) in the Euclidean norm, with its exact Jacobian in `action`."""
-        with torch.no_grad():
-            obs64, action64 = self._broadcast(obs, action)
-            projected, jacobian = self._project(obs64, action64)
+        obs64, action64 = self._broadcast(obs, action)
+        at = self._at(obs64)
+        if is_traced(*tensors_of(at)):
+            solver = Solver(self._project, self._boundaries, self._free)
+            return differentiable_projection(solver, at, action64).to(action.dtype)
+        projected, jacobian = self._project(at, action64.detach())
+        if projected.requires_grad:
+            self._boundaries(at, projected)
         if torch.is_grad_enabled() and action.requires_grad:
             return with_jacobian(action.expand(action64.shape), projected, jacobian)
         return projected.to(action.dtype)
@@ -131,9 +162,10 @@ class Constraint(ABC):
         """
         if not obs.is_floating_point():
             raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
-        with torch.no_grad():
-            center = self._center(obs.detach().double())
-            return center.expand(*obs.shape[:-1], self.dim).to(obs.dtype)
+        center = self._center(self._at(obs.double()))
+        if center is None:
+            return obs.new_zeros(*obs.shape[:-1], self.dim)
+        return center.expand(*obs.shape[:-1], self.dim).to(obs.dtype)
 
     def gauge(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
         """Minkowski functional L (...) >= 0 around an interior `center` (None: the origin must be interior).
@@ -141,10 +173,15 @@ class Constraint(ABC):
         `center + direction / L` is on the boundary; L is convex and positively homogeneous of degree 1.
         """
         obs64, direction64 = self._broadcast(obs, direction)
-        center64 = None if center is None else center.detach().double()
+        center64 = None if center is None else center.double()
+        at = self._at(obs64)
         # L is homogeneous. At length 1, the squares of even the tiniest direction stay above zero.
         size = one_where_zero(direction64.detach().abs().amax(-1))
-        gauge, gradient = self._gauge_and_gradient(obs64, direction64.detach() / size.unsqueeze(-1), center64)
+        if is_traced(center64, *tensors_of(at)):
+            unit = direction64 / size.unsqueeze(-1)
+            gradient = self._gauge_and_gradient(at, unit, center64)[1]
+            return ((gradient * unit).sum(-1) * size).to(direction.dtype)
+        gauge, gradient = self._gauge_and_gradient(at, direction64.detach() / size.unsqueeze(-1), center64)
         return with_gradient(direction64, gauge * size, gradient).to(direction.dtype)
 
     def ray(self, obs: Tensor, action: Tensor, center: Tensor | None = None) -> Ray:
@@ -153,11 +190,13 @@ class Constraint(ABC):
         Offsets are at most 1e150 long, as the squares of longer ones are infinite.
         """
         obs64, action64 = self._broadcast(obs, action)
-        if center is None and not self.origin_centered:
-            center = self.center(obs64)
-        center64 = None if center is None else center.detach().double()
+        at = self._at(obs64)
+        center64 = self._center(at) if center is None else center.double()
         offset = action64 if center64 is None else action64 - center64
-        return Ray(action, center64, offset, lambda direction: self._gauge_and_gradient(obs64, direction, center64))
+        traced = is_traced(center64, *tensors_of(at))
+        return Ray(
+            action, center64, offset, lambda direction: self._gauge_and_gradient(at, direction, center64), traced
+        )
 
     def alpha_map(self, obs: Tensor, action: Tensor, center: Tensor | None = None) -> Tensor:
         """alpha-projection: the feasible point (..., d) closest to `action` on its ray from the centre."""
@@ -193,22 +232,27 @@ class Constraint(ABC):
         return self.ray(obs, action, center).alpha_log_prob(mean, std)
 
     def linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction)."""
-        with torch.no_grad():
-            obs64, gradient64 = self._broadcast(obs, gradient)
-            # Only the direction matters. At length 1, the squares of tiny gradients stay above zero.
-            gradient64 = gradient64 / one_where_zero(gradient64.abs().amax(-1, keepdim=True))
-            return keep_nan(self._linear_oracle(obs64, gradient64), gradient64).to(gradient.dtype)
+        """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction).
+
+        It is a constant: gradients do not pass. RuntimeError where the observation or learned coefficients ask for them.
+        """
+        obs64, gradient64 = self._broadcast(obs, gradient.detach())
+        at = self._at(obs64)
+        if torch.is_grad_enabled() and any(value.requires_grad for value in tensors_of(at)):
+            raise RuntimeError("linear_oracle has no derivatives; pass obs.detach(), or coefficients without gradients")
+        # Only the direction matters. At length 1, the squares of tiny gradients stay above zero.
+        gradient64 = gradient64 / one_where_zero(gradient64.abs().amax(-1, keepdim=True))
+        return keep_nan(self._linear_oracle(at, gradient64), gradient64).to(gradient.dtype)
 
     # ---------------------------------------------------------------- shared pieces
 
-    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _gauge_and_gradient(self, at: Any, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         """Gauge (...) of the whole set, box included, and its gradient (..., d), both 0 where `direction` is.
 
-        The gradient is differentiable in `direction`, the gauge is not.
+        The gradient is differentiable as `_gauge_gradients` says, the gauge is not.
         """
         box = box_gauge_gradient(direction, center)
-        return largest_gauge(direction, box, *self._gauge_gradients(obs, direction, center))
+        return largest_gauge(direction, box, *self._gauge_gradients(at, direction, center))
 
     def _broadcast(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Both in float64, the action with the common leading shape. ValueError or TypeError for a wrong action."""
@@ -216,7 +260,7 @@ class Constraint(ABC):
             raise ValueError(f"expected {self.dim} action coordinates, got {action.shape[-1]}")
         if not action.is_floating_point():
             raise TypeError(f"expected float32 or float64 actions, got {action.dtype}")
-        obs, action = obs.detach().double(), action.double()
+        obs, action = obs.double(), action.double()
         if obs.shape[:-1] != action.shape[:-1]:
             action = action.expand(*torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1]), self.dim)
         return obs, action

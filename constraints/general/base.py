@@ -7,12 +7,13 @@ from torch import Tensor
 
 from constraints.base import Constraint
 from constraints.errors import ConstraintError, name_samples, require
-from constraints.general.centers import chebyshev_centers, interior_points
+from constraints.general.active_set import project_on_rows
+from constraints.general.centers import deep_points, interior_points
 from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.projection import closest_points, optimal_points, projection_jacobian
 from constraints.general.scaled_sets import ScaledSets, scale_sets
 from constraints.jacobian import JacobianProduct
-from constraints.numerics import times
+from constraints.numerics import is_traced, times
 
 # A centre given for a gauge that is nearer than this to the boundary is on it, up to rounding.
 ON_BOUNDARY = 1e-12
@@ -51,16 +52,30 @@ class GeneralConstraint(Constraint):
         size = slope.abs().amax(-1, keepdim=True)
         finite = size.isfinite()
         slope = torch.where(finite & (size > 0.0), slope / size, 0.0)
-        solution = optimal_points(sets, slope, linear=True)[0] if sets.curved else maximize_on_rows(sets, slope)
+        if sets.curved:
+            solution = optimal_points(sets, slope, linear=True)[0]
+        else:
+            corner = sets.given_rows + torch.arange(self.dim) + self.dim * (slope < 0.0)
+            solution, _ = maximize_on_rows(sets.rows, sets.bounds, slope, corner, sets.name, sets.given_rows)
+            # The solution may leave the set by the linear program's rounding.
+            solution = project_on_rows(sets.rows, sets.bounds, solution, sets.name, sets.given_rows)[0]
         return torch.where(finite, solution, torch.nan).view(gradient.shape).to(gradient.device)
 
     def _center(self, obs: Tensor) -> Tensor:
         sets = self._scaled_sets(obs, obs.shape[:-1])
-        center = interior_points(sets) if sets.curved else chebyshev_centers(sets)
+        center = interior_points(sets) if sets.curved else deep_points(sets)
         return center.view(*obs.shape[:-1], self.dim).to(obs.device)
 
     def _scaled_sets(self, obs: Tensor, lead: tuple[int, ...]) -> ScaledSets:
-        return scale_sets(self.explicit(obs), lead)
+        written = self.explicit(obs)
+        ellipses = [value for ellipse in written.ellipses for value in ellipse]
+        if is_traced(written.rows, written.bounds, *ellipses):
+            raise RuntimeError(
+                f"project, center and linear_oracle of {type(self).__name__} have no gradient with respect to the"
+                " observation or to learned coefficients, and no torch.func transforms; pass obs.detach(), or"
+                " coefficients without gradients"
+            )
+        return scale_sets(written, lead)
 
 
 def check_obs(obs: Tensor) -> None:
@@ -74,7 +89,7 @@ def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tens
 
     -1 in `shape` stands for any size; lead may be the observation's leading shape or one that broadcasts to it.
     """
-    values = torch.as_tensor(values, dtype=torch.float64, device=obs.device).detach()
+    values = torch.as_tensor(values, dtype=torch.float64, device=obs.device)
     lead = values.shape[: values.dim() - len(shape)]
     fits = len(values.shape) >= len(shape) and all(
         have == want or want == -1 for have, want in zip(values.shape[len(lead) :], shape, strict=True)

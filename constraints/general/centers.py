@@ -1,44 +1,73 @@
-"""Interior points: Chebyshev centres of rows, deepest points of sets with ellipses."""
+"""Interior points of sets of rows, and of sets with ellipses."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from constraints.errors import require
+from constraints.errors import EmptySetError, require
+from constraints.general.active_set import project_on_rows
 from constraints.general.interior_point import solve_cone_programs
-from constraints.general.linear_programs import solve_linear_programs
+from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.scaled_sets import NO_INTERIOR, ScaledSets
 from constraints.numerics import times
 
-# A guess nearer to the boundary than this gives way to the deepest point.
-_NEAR_BOUNDARY = 1e-6
+# The share of the largest radius that a centre keeps. A larger one leaves less room in which it moves continuously.
+_DEEP = 0.9
+_TRACE = 1e-11
+# A guess less deep than this, or than half of the largest depth, gives way to the deepest point.
+_SHALLOW = 1e-2
 # The interior-point method's accuracy: deep enough below NO_INTERIOR to tell a thin set from a flat one.
 _ACCURACY = 1e-12
 
 
-def chebyshev_centers(sets: ScaledSets) -> Tensor:
-    """Chebyshev centres (n, d) of sets without ellipses; a ConstraintError where a set is empty or flat."""
-    solid = sets.rows.abs().amax(-1, keepdim=True) > 0.0
-    rows = torch.cat((sets.rows, solid.to(sets.rows.dtype)), -1)
-    objective = torch.zeros(len(rows), sets.dim + 1, dtype=rows.dtype)
-    objective[:, -1] = 1.0
-    solution = solve_linear_programs(objective, rows, sets.bounds)
-    radius = solution[:, -1]
-    require(radius >= -NO_INTERIOR, "the set is empty", sets.name)
+def deep_points(sets: ScaledSets) -> Tensor:
+    """Centres (n, d) of sets without ellipses: the point nearest to the origin of those that are `_DEEP` times as deep
+    as the deepest. A ConstraintError where a set is empty or flat.
+
+    It is continuous in rows and bounds. The largest depth is: it is the maximum over the box of a continuous function.
+    The points of that share of it are a convex set with interior, so they move continuously, and so does the one of
+    them that is nearest to the origin. The deepest points themselves may jump: those of a wedge are at its wide end,
+    however small its angle.
+    """
+    radius = largest_radius(sets)
+    require(radius >= -NO_INTERIOR, "the set is empty", sets.name, EmptySetError)
     require(radius > NO_INTERIOR, "the set has no interior", sets.name)
-    return solution[:, :-1]
+    bounds = sets.bounds - _DEEP * radius.unsqueeze(-1) * sets.solid
+    return project_on_rows(sets.rows, bounds, torch.zeros_like(sets.rows[:, 0]), sets.name, sets.given_rows)[0]
+
+
+def largest_radius(sets: ScaledSets) -> Tensor:
+    """Radius (n,) of the largest ball in each set, the ellipses left out; negative where it is empty."""
+    m, d = sets.given_rows, sets.dim
+    # The last coordinate is the radius; rows have unit norm again. Zero rows do not bound it.
+    shrink = torch.where(sets.solid, 0.5, 1.0).to(sets.rows).sqrt()
+    rows = torch.cat((sets.rows, sets.solid.to(sets.rows).unsqueeze(-1)), -1) * shrink.unsqueeze(-1)
+    # To begin with, two opposite faces of the box hold the radius. The others get a trace of it, so that the simplex
+    # method does not exchange rows without effect.
+    slope = torch.full_like(rows[:, 0], _TRACE)
+    slope[:, 0], slope[:, -1] = 0.0, 1.0
+    basis = m + torch.cat((torch.arange(d, device=rows.device), torch.tensor([d], device=rows.device)))
+    basis = basis.expand(len(rows), -1)
+    return maximize_on_rows(rows, sets.bounds * shrink, slope, basis, sets.name, sets.given_rows)[0][:, -1]
 
 
 def interior_points(sets: ScaledSets) -> Tensor:
-    """Interior points (n, d) of sets with ellipses: the guess or, where that is not interior, the deepest point."""
-    candidate = guessed_points(sets)
-    shallow = (sets.depth(candidate) <= _NEAR_BOUNDARY).nonzero().squeeze(-1)
-    if len(shallow) == 0:
-        return candidate
-    candidate = candidate.clone()
-    candidate[shallow] = deepest_points(sets[shallow])
-    return candidate
+    """Interior points (n, d) of sets with ellipses: the guess where it is deep, the deepest point where it is outside.
+
+    In between it is a mean of the two, so that the centre does not jump where the guess leaves the set.
+    """
+    point = guessed_points(sets)
+    depth = sets.depth(point)
+    shallow = (depth < _SHALLOW).nonzero().squeeze(-1)
+    if len(shallow) > 0:
+        part, depth = sets[shallow], depth[shallow]
+        deepest = deepest_points(part)
+        deep = (0.5 * part.depth(deepest)).clamp(max=_SHALLOW)
+        # The depth is concave, so that of a mean is at least the mean of the two, which is positive.
+        share = (0.5 - 0.5 * depth / deep).clamp(0.0, 1.0).unsqueeze(-1)
+        point = point.index_put((shallow,), torch.lerp(point[shallow], deepest, share))
+    return point
 
 
 def guessed_points(sets: ScaledSets) -> Tensor:
@@ -49,7 +78,6 @@ def guessed_points(sets: ScaledSets) -> Tensor:
 
 def deepest_points(sets: ScaledSets) -> Tensor:
     """Points (n, d) of the largest `depth`, of sets with ellipses; a ConstraintError where that is not positive."""
-    solid = sets.rows.abs().amax(-1, keepdim=True) > 0.0
     # Around the centre of the smallest ellipse, in its size.
     traces = sets.matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
     size = sets.inverse_size()
@@ -60,7 +88,7 @@ def deepest_points(sets: ScaledSets) -> Tensor:
     sink = torch.zeros_like(offset)
     sink[..., 0] = 1.0 / (size * sets.root)
     matrix = torch.cat((matrix, sink.unsqueeze(-1)), -1)
-    rows = torch.cat((sets.rows, solid.to(sets.rows.dtype)), -1)
+    rows = torch.cat((sets.rows, sets.solid.to(sets.rows).unsqueeze(-1)), -1)
     bounds = size * (sets.bounds - times(sets.rows, origin))
     gradient = torch.zeros_like(rows[:, 0])
     gradient[:, -1] = 1.0
@@ -71,6 +99,6 @@ def deepest_points(sets: ScaledSets) -> Tensor:
     point = origin + solution[:, :-1]
     deep = sets.depth(point) > NO_INTERIOR
     require(deep | converged, "the interior-point method failed", sets.name)
-    require(deep | (solution[:, -1] >= -NO_INTERIOR), "the set is empty", sets.name)
+    require(deep | (solution[:, -1] >= -NO_INTERIOR), "the set is empty", sets.name, EmptySetError)
     require(deep, "the set has no interior", sets.name)
     return point

@@ -15,8 +15,9 @@ class Intersection(GeneralConstraint):
 
     Each is a constraint of this package, a user's own with `explicit`, or another intersection; ValueError for none, or
     for different dimensions. `penalty` is the sum of their penalties, `violation` the largest violation. `center` is
-    the Chebyshev centre if all are linear. With an ellipse it is the origin where that is interior, otherwise the point
-    deepest in the set. Methods raise a ConstraintError as those of LinearConstraint and QuadraticConstraint do.
+    that of a LinearConstraint if all are linear. With an ellipse it is the origin where that is interior, otherwise the
+    point deepest in the set, and a mean of both where the origin is near the boundary. Methods raise a ConstraintError
+    as those of LinearConstraint and QuadraticConstraint do.
     """
 
     def __init__(self, *constraints: Constraint):
@@ -39,12 +40,14 @@ class Intersection(GeneralConstraint):
 
     def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
         check_obs(obs)
-        excess = [constraint._violation(obs, action) for constraint in self.constraints]
+        excess = [constraint._violation(constraint._at(obs), action) for constraint in self.constraints]
         return torch.stack(torch.broadcast_tensors(*excess)).amax(0)
 
     def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         check_obs(obs)
-        return sum((constraint._penalty(obs, action) for constraint in self.constraints), 0.0 * action.sum(-1))
+        return sum(
+            (constraint._penalty(constraint._at(obs), action) for constraint in self.constraints), 0.0 * action.sum(-1)
+        )
 
     def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         check_obs(obs)
@@ -52,7 +55,7 @@ class Intersection(GeneralConstraint):
         for constraint in self.constraints:
             # The closed forms do not check the centre.
             if not isinstance(constraint, GeneralConstraint) and center is not None:
-                inside = constraint._violation(obs, center) < -ON_BOUNDARY
+                inside = constraint._violation(constraint._at(obs), center) < -ON_BOUNDARY
                 require(inside.flatten(), "the centre is not interior", name_samples(tuple(inside.shape)))
-            gradients.append(constraint._gauge_and_gradient(obs, direction, center)[1])
+            gradients.append(constraint._gauge_and_gradient(constraint._at(obs), direction, center)[1])
         return gradients

@@ -17,10 +17,11 @@ from constraints.numerics import safe_sqrt, times
 class LinearConstraint(GeneralConstraint):
     """A(obs) a <= b(obs) in the box [-1, 1]^dim.
 
-    Pass A and b as functions, or override them in a subclass; TypeError where one is missing. `center` is the Chebyshev
-    centre. Methods raise a ConstraintError for NaN or infinite observations or coefficients, wrong shapes and an empty
-    set; `center`, and methods that need one, also for a set without interior. It names the sample, and the row where
-    there is one.
+    Pass A and b as functions, or override them in a subclass; TypeError where one is missing. `center` is the point
+    nearest to the origin of those that are at least 0.9 times as deep as the Chebyshev centre: it is unique and
+    continuous in A and b, and 0 in coordinates that no row uses. Methods raise a ConstraintError for NaN or infinite
+    observations or coefficients, wrong shapes and an empty set; `center`, and methods that need one, also for a set
+    without interior. It names the sample, and the row where there is one.
     """
 
     def __init__(

@@ -23,11 +23,11 @@ class QuadraticConstraint(GeneralConstraint):
     """(a - c(obs))' Q(obs) (a - c(obs)) <= bound(obs) in the box [-1, 1]^dim, Q positive semi-definite, bound > 0.
 
     Pass Q, bound (a function or a number) and c (default: the origin), or override them in a subclass; TypeError where
-    Q or bound is missing. `center` is c, or the point deepest in the set where c is not inside the box. Methods raise a
-    ConstraintError that names the sample for NaN or infinite observations or coefficients, wrong shapes, a Q that is
-    not positive semi-definite, a bound that is not positive, and an empty set. A set without interior is nowhere deeper
-    than 1e-9: `center`, and methods that need one, raise for it, `project` and `linear_oracle` only where it leaves no
-    unique multipliers.
+    Q or bound is missing. `center` is c, the point deepest in the set where c is not inside the box, and a mean of both
+    where c is near its boundary. Methods raise a ConstraintError that names the sample for NaN or infinite observations
+    or coefficients, wrong shapes, a Q that is not positive semi-definite, a bound that is not positive, and an empty
+    set. A set without interior is nowhere deeper than 1e-9: `center`, and methods that need one, raise for it,
+    `project` and `linear_oracle` only where it leaves no unique multipliers.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class QuadraticConstraint(GeneralConstraint):
         matrix = 0.5 * (matrix + matrix.mT)
         least = torch.linalg.eigvalsh(matrix)[..., 0]
         require((least >= -_ROUNDING * largest).flatten(), "Q(obs) is not positive semi-definite", name)
-        matrix = matrix + (-least).clamp(min=0.0)[..., None, None] * torch.eye(
+        matrix = matrix + (-least.detach()).clamp(min=0.0)[..., None, None] * torch.eye(
             self.dim, dtype=matrix.dtype, device=matrix.device
         )
         require((bound > 0.0).flatten(), "bound(obs) is not positive", name_samples(tuple(bound.shape)))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from constraints.base import ExplicitSet
-from constraints.errors import SampleName, name_samples, require
+from constraints.errors import EmptySetError, SampleName, name_samples, require
 from constraints.numerics import one_where_zero, times
 
 # The set is empty where its constraints miss each other by more than this. A smaller gap is rounding.
@@ -48,15 +48,19 @@ class ScaledSets:
         """Whether there are ellipses."""
         return self.matrix.shape[1] > 0
 
+    @property
+    def solid(self) -> Tensor:
+        """Which rows (n, m) are not 0."""
+        return (self.rows != 0.0).any(-1)
+
     def __getitem__(self, index: Tensor) -> ScaledSets:
-        positions = index.tolist()
         return ScaledSets(
             self.rows[index],
             self.bounds[index],
             self.matrix[index],
             self.center[index],
             self.root[index],
-            lambda i: self.name(positions[i]),
+            self.name.part(index.tolist()),
         )
 
     def ellipse_values(self, point: Tensor) -> tuple[Tensor, Tensor]:
@@ -72,9 +76,8 @@ class ScaledSets:
 
     def depth(self, point: Tensor) -> Tensor:
         """Distance (n,) to the nearest constraint, in the units of `Constraint.violation`; negative outside."""
-        solid = self.rows.abs().amax(-1) > 0.0
         slack = self.bounds - times(self.rows, point)
-        depths = [torch.where(solid | (slack < 0.0), slack, torch.inf)]
+        depths = [torch.where(self.solid | (slack < 0.0), slack, torch.inf)]
         if self.curved:
             value = self.ellipse_values(point)[0].clamp(min=0.0)
             depths.append(self.root * (1.0 - value.sqrt()))
@@ -106,7 +109,7 @@ def scale_sets(written: ExplicitSet, lead: tuple[int, ...]) -> ScaledSets:
     # A row that touches the box in a face, an edge or a corner is met there.
     reach = rows.abs().sum(-1)
     met = torch.where(reach > 0.0, bounds >= -reach - EMPTY, bounds >= 0.0)
-    require(met, "the set is empty", name_samples(tuple(lead)))
+    require(met, "the set is empty", name_samples(tuple(lead)), EmptySetError)
     # 0 <= 0 holds everywhere, with slack.
     bounds = torch.where((rows == 0.0).all(-1) & (bounds == 0.0), 1.0, bounds)
     faces = torch.eye(d, dtype=rows.dtype).expand(len(rows), d, d)

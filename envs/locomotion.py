@@ -9,6 +9,8 @@ import os
 import sys
 import weakref
 from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -37,19 +39,26 @@ def import_mujoco() -> Any:
         os.environ["MUJOCO_GL"] = chosen
 
 
+@contextmanager
+def silent_mujoco() -> Iterator[None]:
+    """Hide warnings: half_cheetah.xml makes MuJoCo print one and leave a MUJOCO_LOG.TXT where the process runs."""
+    mujoco = import_mujoco()
+    warning_handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(warning_handler)
+
+
 @functools.cache
 def _load_model(file: str) -> Any:
     """The MuJoCo model of `file`, which robots share: half a megabyte each would crowd the processor's cache."""
     mujoco = import_mujoco()
     # Gymnasium's own path without its `envs.mujoco` package, which would load every MuJoCo task
     assets = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
-    # half_cheetah.xml makes MuJoCo print a deprecation and leave a MUJOCO_LOG.TXT where the process runs
-    warning_handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
+    with silent_mujoco():
         return mujoco.MjModel.from_xml_path(os.path.join(assets, file))
-    finally:
-        mujoco.set_mju_user_warning(warning_handler)
 
 
 class _Locomotion(SimulatedRobot):
@@ -146,7 +155,19 @@ class _Locomotion(SimulatedRobot):
 
 
 class HalfCheetah(_Locomotion):
-    """Observation (17,), velocities as they are; action (6,). Never terminates."""
+    """Action (6,): torques of the driven joints, in their order. Never terminates. Observation (17,):
+
+        0      height in m, less the 0.7 m of the model's pose: rootz
+        1      pitch in rad: rooty
+        2-7    angles of the driven joints in rad:
+               bthigh, bshin, bfoot, fthigh, fshin, ffoot
+        8-9    velocities of the torso in m/s: rootx, rootz
+        10     velocity of the pitch in rad/s: rooty
+        11-16  velocities of the driven joints in rad/s:
+               bthigh, bshin, bfoot, fthigh, fshin, ffoot
+
+    A joint has the name that it has in MuJoCo's model.
+    """
 
     model_file, frame_skip, obs_dim, action_dim = "half_cheetah.xml", 5, 17, 6
     ctrl_cost_weight, healthy_reward = 0.1, 0.0
@@ -181,7 +202,17 @@ class _Upright(_Locomotion):
 
 
 class Hopper(_Upright):
-    """Observation (11,), action (3,). Falls below 0.7 m, past 0.2 rad or at a state beyond +-100."""
+    """Action (3,): torques of the driven joints, in their order. Observation (11,), velocities clipped to +-10:
+
+        0     height in m: rootz
+        1     pitch in rad: rooty
+        2-4   angles of the driven joints in rad: thigh_joint, leg_joint, foot_joint
+        5-6   velocities of the torso in m/s: rootx, rootz
+        7     velocity of the pitch in rad/s: rooty
+        8-10  velocities of the driven joints in rad/s: thigh_joint, leg_joint, foot_joint
+
+    Falls below 0.7 m, past 0.2 rad or at a state beyond +-100.
+    """
 
     hyperparameters = "Hopper"  # its group in the paper's table
     model_file, obs_dim, action_dim = "hopper.xml", 11, 3
@@ -193,7 +224,19 @@ class Hopper(_Upright):
 
 
 class Walker2d(_Upright):
-    """Observation (17,), action (6,). Falls outside 0.8 m to 2 m and past 1 rad."""
+    """Action (6,): torques of the driven joints, in their order. Observation (17,), velocities clipped to +-10:
+
+        0      height in m: rootz
+        1      pitch in rad: rooty
+        2-7    angles of the driven joints in rad:
+               thigh_joint, leg_joint, foot_joint, thigh_left_joint, leg_left_joint, foot_left_joint
+        8-9    velocities of the torso in m/s: rootx, rootz
+        10     velocity of the pitch in rad/s: rooty
+        11-16  velocities of the driven joints in rad/s:
+               thigh_joint, leg_joint, foot_joint, thigh_left_joint, leg_left_joint, foot_left_joint
+
+    Falls outside 0.8 m to 2 m and past 1 rad.
+    """
 
     model_file, obs_dim, action_dim = "walker2d.xml", 17, 6
 

@@ -132,8 +132,8 @@ class PyBulletReacher(SimulatedRobot):
 
     def set_state(self, state: np.ndarray) -> np.ndarray:
         """Continue from `state` (9,), which `get_state` returned; return the observation (9,)."""
-        *joints, target_x, target_y, dx, dy, potential = state.tolist()
-        self.place(*joints, target=(target_x, target_y))
+        q1, q2, w1, w2, target_x, target_y, dx, dy, potential = state.tolist()
+        self.place(q1, q2, w1, w2, target=(target_x, target_y))
         obs = self._observe()[0]
         obs[2:4] = self._to_target = dx, dy  # the reported fingertip is one step late, see `envs.reacher.State`
         self._potential = potential

@@ -164,25 +164,23 @@ class _Check:
 
     def equal_robots(self, first: list[Step]) -> None:
         """Check that an episode depends on its random numbers and actions alone."""
-        machine = self.new()
-        again = [self.begin(machine), *self.play(machine, self.actions)]
+        plain, spoilt, beside, other = (self.new() for _ in range(4))
+        again = [self.begin(plain), *self.play(plain, self.actions)]
         why = "two robots given the same random numbers and actions differ; draw all random numbers from reset's rng"
         self.compare(first, again, why)
-        again = [self.begin(machine, spoil=True), *self.play(machine, self.actions, spoil=True)]
-        self.compare(
-            first, again, "it keeps arrays that it returned or was given, whose caller may write into them; copy them"
-        )
-        other = self.new()
-        again = [self.begin(machine)]
+        again = [self.begin(spoilt, spoil=True), *self.play(spoilt, self.actions, spoil=True)]
+        why = "it keeps arrays that it returned or was given, whose caller may write into them; copy them"
+        self.compare(first, again, why)
+        again = [self.begin(beside)]
         self.begin(other, seed=1)
         for action in self.actions[: len(first) - 1]:
-            again += self.play(machine, [action])
+            again += self.play(beside, [action])
             if self.play(other, [-action])[0][2]:
                 self.begin(other, seed=2)
-        self.compare(
-            first, again, "a robot changes when another one steps; keep its state in the object, not the class"
-        )
-        machine.close(), other.close()
+        why = "a robot changes when another one steps; keep its state in the object, not the class"
+        self.compare(first, again, why)
+        for machine in (plain, spoilt, beside, other):
+            machine.close()
 
     def earlier_episodes(self, first: list[Step]) -> None:
         """Check that an episode does not depend on those before it."""
@@ -212,6 +210,7 @@ class _Check:
                 self.fail(f".get_state() returns {state!r}; it returns a NumPy array (k,) of float64, at every step")
             copy = state.copy()
             self.play(machine, self.actions[at:])
+            machine.get_state()
             if not np.array_equal(state, copy, equal_nan=True):
                 self.fail(": the state that get_state() returned changes at a later step; return a new array")
             fresh = self.new()

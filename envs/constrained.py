@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import json
 import math
@@ -145,7 +146,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         self._refuse_closed("reset")
         super().reset(seed=seed)
         self._start, self._actions, self.elapsed_steps = self.np_random.bit_generator.state, [], 0
-        self._shown = None
+        self._obs, self._shown = None, None
         obs = self.robot.reset(self.np_random)
         self._keeps_actions = self.robot.get_state() is None
         self._obs = obs.copy()
@@ -199,7 +200,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         self._start, self._actions, self._obs, self._shown = None, [], None, None
         if state["robot"] is not None:
             self._start, self._keeps_actions = self.np_random.bit_generator.state, False
-            self._obs = self.robot.set_state(state["robot"].numpy())
+            self._obs = self.robot.set_state(state["robot"].numpy()).copy()
         elif state["in_episode"]:
             self._start, self._keeps_actions = self.np_random.bit_generator.state, True
             self._actions = [] if state["actions"] is None else list(state["actions"].numpy())
@@ -226,9 +227,12 @@ class ActionConstrainedEnv(gymnasium.Env):
         self.robot.close()
         self._obs, self._closed = None, True
 
+    def __copy__(self) -> ActionConstrainedEnv:
+        return copy.deepcopy(self)  # two environments never share a simulator or random numbers
+
     def __getstate__(self) -> dict[str, Any]:
         for owner in (self, self.action_space, self.observation_space):
-            assert owner.np_random is not None  # now there is one, with which the copy begins as well
+            _ = owner.np_random  # made now where there is none, so that the copy has the same
         content = {name: value for name, value in vars(self).items() if name not in ("robot", "constraint")}
         in_simulator = self._start is not None and not self._closed
         return content | {"robot": self.robot.get_state() if in_simulator else None}

@@ -282,8 +282,9 @@ class _Picture:
                 f"the OpenGL backend {backend!r} does not work on this machine ({error!r}); without a "
                 "display, install libegl1 or libosmesa6 and set MUJOCO_GL to 'egl' or 'osmesa'"
             ) from error
-        # called once: by close(), when the object goes, or when the process ends
+        # called once, by close() or when the object goes
         self.close = weakref.finalize(self, _free, self._gl, self._context)
+        self.close.atexit = False  # OpenGL may be gone before, and the process frees its memory anyway
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._mujoco, self._model = mujoco, model
         self._scene, self._option = mujoco.MjvScene(model, maxgeom=1000), mujoco.MjvOption()

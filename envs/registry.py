@@ -110,7 +110,7 @@ class Tasks(MutableMapping[str, Task]):
         gymnasium.register(
             identifier,
             entry_point="envs.constrained:ActionConstrainedEnv",
-            max_episode_steps=task.robot.max_episode_steps,
+            max_episode_steps=int(task.robot.max_episode_steps),
             additional_wrappers=(WrapperSpec("GivenTimeLimit", "envs.constrained:GivenTimeLimit", {}),),
             kwargs={"task": name},
         )

@@ -57,6 +57,7 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
         torch.cuda.set_device(config.device)
+    check_robot(config.env)
     check_constraint(config.env, config.simulator)
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     if config.steps <= config.learning_starts:
@@ -135,6 +136,14 @@ def make_env(task: str, simulator: str | None) -> envs.ActionConstrainedEnv:
         return envs.make(task, simulator=simulator)
     except envs.UnavailableError as error:
         raise ConfigError(str(error)) from error
+
+
+def check_robot(task: str) -> None:
+    """Raise ConfigError if the robot of `task` does not keep the protocol of `envs.Robot` in a few steps."""
+    try:
+        envs.check_robot(TASKS[task].robot, steps=10)
+    except envs.RobotError as error:
+        raise ConfigError(f"the robot of {task} does not work: {error}") from error
 
 
 def check_constraint(task: str, simulator: str | None) -> None:

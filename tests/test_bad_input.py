@@ -139,8 +139,6 @@ def ones(obs, *shape):
 
 
 CONSTRAINTS = {
-    "None": (lambda: None, "'NoneType' object has no attribute 'dim'"),
-    "another dimension": (lambda: Box(3), "it is for 3 action coordinates, the robot has 2"),
     "weights of another dimension": (lambda: WeightedL1(lambda obs: obs[..., :3], 1.0, 2), "size of tensor a (3)"),
     "weights that are NaN": (
         lambda: WeightedL1(lambda obs: obs[..., :2] * torch.nan, 1.0, 2),

@@ -63,7 +63,10 @@ def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.nda
     """
     if len(set(map(id, envs))) < len(envs) or any(env.constraint is not envs[0].constraint for env in envs):
         raise ValueError("step_together() takes different environments of one constraint")
-    outcomes: list[Any] = [env._well_formed(action) for env, action in zip(envs, actions, strict=True)]
+    if _all_well_formed(envs, actions):
+        outcomes: list[Any] = [*actions]
+    else:
+        outcomes = [env._well_formed(action) for env, action in zip(envs, actions, strict=True)]
     checked = [k for k, outcome in enumerate(outcomes) if not isinstance(outcome, InfeasibleActionError)]
     if not checked:
         return outcomes
@@ -80,6 +83,13 @@ def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.nda
         for k, step in zip(admitted, steps, strict=True):
             outcomes[k] = envs[k]._record(outcomes[k], step)
     return outcomes
+
+
+def _all_well_formed(envs: Sequence[ActionConstrainedEnv], actions: Any) -> bool:
+    """Whether each action is well-formed and each environment ready, asked of all at once. It may say no wrongly."""
+    if not envs or not isinstance(actions, np.ndarray) or actions.shape != (len(envs), envs[0].constraint.dim):
+        return False
+    return all(env._obs is not None for env in envs) and bool(np.isfinite(actions).all())
 
 
 class ActionConstrainedEnv(gymnasium.Env):

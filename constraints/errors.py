@@ -2,31 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 from torch import Tensor
 
-SampleName = Callable[[int], str]
-"""Names a sample of a flattened batch, as in 'sample 3' or 'sample (1, 2)'."""
-
 
 class ConstraintError(ValueError):
-    """An operation that the constraint's coefficients, its observation or the set itself do not allow."""
+    """An operation that the constraint's coefficients, its observation or the set itself do not allow.
+
+    Attributes: `index`, the position of the (first) sample that it is about in the leading dimensions of the
+    observations; None where it is about no single sample.
+    """
+
+    def __init__(self, message: str, index: tuple[int, ...] | None = None):
+        super().__init__(message)
+        self.index = index
+
+
+class SampleName:
+    """Names the samples of a flattened batch of shape `lead`, as in 'sample 3' or 'sample (1, 2)'.
+
+    `chosen` are those of them that there are; None for all.
+    """
+
+    def __init__(self, lead: tuple[int, ...], chosen: Sequence[int] | None = None):
+        self.lead, self.chosen = lead, chosen
+
+    def __call__(self, index: int) -> str:
+        position = self.position(index)
+        if not position:
+            return "the only sample"
+        return f"sample {position[0] if len(position) == 1 else position}"
+
+    def position(self, index: int) -> tuple[int, ...]:
+        """The position in the batch of shape `lead` of the sample number `index`."""
+        if self.chosen is not None:
+            index = self.chosen[index]
+        position: list[int] = []
+        for size in reversed(self.lead):
+            index, last = divmod(index, size)
+            position.insert(0, last)
+        return tuple(position)
+
+    def of(self, chosen: Sequence[int]) -> SampleName:
+        """Names of the samples number `chosen` of these."""
+        return SampleName(self.lead, [i if self.chosen is None else self.chosen[i] for i in chosen])
 
 
 def name_samples(lead: tuple[int, ...]) -> SampleName:
     """Names for a batch of shape `lead`."""
-
-    def name(index: int) -> str:
-        position: list[int] = []
-        for size in reversed(lead):
-            index, last = divmod(index, size)
-            position.insert(0, last)
-        if not position:
-            return "the only sample"
-        return f"sample {position[0] if len(position) == 1 else tuple(position)}"
-
-    return name
+    return SampleName(lead)
 
 
 def check_bound(bound: float) -> None:
@@ -41,4 +66,4 @@ def require(valid: Tensor, message: str, name: SampleName) -> None:
         return
     first = (~valid).nonzero()[0].tolist()
     row = f", row {first[1]}" if len(first) > 1 else ""
-    raise ConstraintError(f"{name(first[0])}{row}: {message}")
+    raise ConstraintError(f"{name(first[0])}{row}: {message}", name.position(first[0]))

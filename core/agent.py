@@ -130,7 +130,16 @@ class Agent(Snapshots):
         """One gradient step of every seed."""
 
     def start_rollout(self, which: Sequence[int]) -> None:  # noqa: B027 - most algorithms have nothing to do
-        """Called for the seeds `which` before the first step of each of their rollouts."""
+        """Called for the seeds `which` before the first step of each of their rollouts, in warm-up too."""
+
+    def start_episode(self, which: Sequence[int]) -> None:  # noqa: B027 - most algorithms have nothing to do
+        """Called for the seeds `which` before the first step of each of their training episodes, in warm-up too.
+
+        It is for what an episode starts with, as the noise of an Ornstein-Uhlenbeck process. Draw from
+        `self.exploration` with `which=which`, write to the rows `which` alone, and give the tensor to `memory()`: a
+        resumed training goes on within the episode, without another call. Where a rollout starts too, `start_rollout`
+        follows. Episodes of evaluations have no call.
+        """
 
     def statistics(self) -> dict[str, Tensor]:
         """Measures of the last gradient step: name -> (seeds,)."""

@@ -204,6 +204,7 @@ def test_a_constraint_that_breaks_down_later_says_where(capsys, tmp_path, monkey
 
     calls = []
     monkeypatch.setitem(TASKS, "R+X", Task(Reacher, rows(lambda o: ones(o, 1, 2), bound), "a task", "a formula", 20))
-    assert run_command(f"algo=DPre env=R+X {WORDS} results={tmp_path}".split()) == 2
-    assert capsys.readouterr().err.splitlines()[-1].endswith("the set is empty")
+    assert run_command(f"algo=DPre env=R+X {WORDS} results={tmp_path}".split()) == 3
+    assert "failed at step" in (line := capsys.readouterr().err.splitlines()[-1])
+    assert "the set is empty, at observation [" in line
     assert not list(tmp_path.rglob("*.lock"))

@@ -81,7 +81,8 @@ def project_on_rows(
             # The row that cannot be met, or one that is in its way; not a row of the box.
             conflict = [row for row in [int(entering[first]), *index[first].tolist()] if 0 <= row < named]
             which = f", row {conflict[0]}" if conflict else ""
-            raise ConstraintError(f"{name(int(sample[first]))}{which}: the set is empty")
+            empty = int(sample[first])
+            raise ConstraintError(f"{name(empty)}{which}: the set is empty", name.position(empty))
         # The active rows meet a dependent row up to rounding: raise its limit.
         limits[stuck.nonzero().squeeze(-1), entering[stuck]] += over[stuck].clamp(min=0.0) + tolerance[stuck]
 
@@ -109,4 +110,6 @@ def project_on_rows(
         gram = normals @ normals.mT + torch.diag_embed((index < 0).to(rows.dtype))
         back = normals.mT @ torch.linalg.solve_ex(gram, offset)[0]
         point = point + torch.where(pending.unsqueeze(-1), 0.0, back.squeeze(-1).nan_to_num())
-    raise ConstraintError(f"{name(int(sample[0]))}: no active set found; rows may be parallel up to rounding")
+    first = int(sample[0])
+    message = f"{name(first)}: no active set found; rows may be parallel up to rounding"
+    raise ConstraintError(message, name.position(first))

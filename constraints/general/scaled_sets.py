@@ -56,7 +56,7 @@ class ScaledSets:
             self.matrix[index],
             self.center[index],
             self.root[index],
-            lambda i: self.name(positions[i]),
+            self.name.of(positions),
         )
 
     def ellipse_values(self, point: Tensor) -> tuple[Tensor, Tensor]:

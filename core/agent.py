@@ -142,7 +142,11 @@ class Agent(Snapshots):
         """
 
     def statistics(self) -> dict[str, Tensor]:
-        """Measures of the last gradient step: name -> (seeds,)."""
+        """Measures of the last gradient steps, for training.csv: name -> (seeds,), the same names in every call.
+
+        Called beside an evaluation, after the first gradient step. A training that resumes may ask before its next
+        gradient step, so keep the numbers in `memory()` or compute them from it.
+        """
         return {}
 
     @property

@@ -4,7 +4,7 @@
         config.yaml      the resolved configuration
         info.json        versions, git commit, machine, threads, command, start time; again for each resumption
         evaluations.csv  step,return_mean,return_1,...,return_k,seconds: one row an evaluation, appended
-        training.csv     step and the algorithm's own measures (SAC: temperature, entropy), from the first update on
+        training.csv     step and the algorithm's own measures (SAC: temperature, entropy; TD3: losses, mean Q)
         best.pt last.pt  state dicts
         result.json      the final evaluation; written last, so its presence means that the run is finished
         failed.json      instead of result.json if the run diverged: the step, what was not finite, last evaluation,

@@ -135,7 +135,7 @@ def test_the_others_resume_exactly_after_an_empty_set(tmp_path, monkeypatch, gap
 def test_all_seeds_may_meet_an_empty_set(tmp_path, gaps):
     gaps.is_gap = lambda obs: obs[..., 0] > -2  # a cosine: everywhere
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sweep.train.check_constraint", lambda *_: None)  # it would refuse the task
+        patch.setattr("sweep.train.check_training", lambda *_: None)  # it would refuse the task
         assert run_command([*f"algo=DRad {WORDS}".split(), f"results={tmp_path}"]) == 3
     assert len(failures(tmp_path)) == 3
     assert all(failure["step"] == 0 and "result" not in failure for failure in failures(tmp_path).values())

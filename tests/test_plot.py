@@ -441,7 +441,7 @@ def test_different_configurations_are_never_averaged(tmp_path):
         ("gamma=0.5", "SRad", 1000.0, "1"),
         ("gamma=0.99", "SRad", 15.0, "2"),
     }
-    names = ["R+N", "R+N,batch_size=16", "R+N,gamma=0.5", "R+N,gamma=0.99", "aggregate,gamma=0.99"]
+    names = ["R+N", "R+N,batch_size=16", "R+N,gamma=0.5", "R+N,gamma=0.99", "R+N-training", "aggregate,gamma=0.99"]
     assert sorted(path.stem for path in (tmp_path / "figures").glob("*.png")) == names
 
 

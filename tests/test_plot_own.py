@@ -54,7 +54,8 @@ def test_own_algorithms_can_be_told_apart(tmp_path, drawn):
     ]
     assert len(set(colors[0].values())) == 3
     assert colors[0]["Other"] == colors[1]["Other"] != colors[1]["Zeta"]  # the same in every figure
-    profiles = {line.get_label(): line.get_color() for line in drawn["aggregate"].axes[1].lines}
+    lines = [line for axes in drawn["aggregate"].axes for line in axes.lines]
+    profiles = {line.get_label(): line.get_color() for line in lines}
     assert profiles["Mine"] == colors[0]["Mine"]
 
 

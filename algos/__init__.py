@@ -15,6 +15,7 @@ from constraints import Constraint
 from core.agent import Agent
 from core.config import Config, PenaltyConfig, keys_of, restore_settings
 from core.maps import Alpha, Gauge, Map, Placement, Project, Radial
+from core.words import known_name
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,16 @@ def paper_settings(name: str, task: str, robot: Any, steps: int) -> Config:
     `robot.hyperparameters` names its group in the paper's table.
     """
     return ALGORITHMS[name].paper_config(name, task, robot.hyperparameters, steps)
+
+
+def check_algorithm(name: str) -> None:
+    """Check the contracts of `core.agent.Agent` on the algorithm `name`, in seconds, with small trainings.
+
+    Raises `algos.check.ContractError`, whose message names the mistake and the remedy; ConfigError for an unknown name.
+    """
+    from algos.check import check  # only here: it trains, and needs what training needs
+
+    check(known_name("algorithm", name, ALGORITHMS), ALGORITHMS[name])
 
 
 def setting_keys() -> dict[str, Field]:

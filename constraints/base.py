@@ -234,7 +234,7 @@ class Constraint(ABC):
     def linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction).
 
-        It is a constant: gradients do not pass. RuntimeError where the observation or learned coefficients ask for them.
+        It is a constant: no gradients pass. RuntimeError where the observation or learned coefficients ask for them.
         """
         obs64, gradient64 = self._broadcast(obs, gradient.detach())
         at = self._at(obs64)

@@ -130,10 +130,23 @@ class Agent(Snapshots):
         """One gradient step of every seed."""
 
     def start_rollout(self, which: Sequence[int]) -> None:  # noqa: B027 - most algorithms have nothing to do
-        """Called for the seeds `which` before the first step of each of their rollouts."""
+        """Called for the seeds `which` before the first step of each of their rollouts, in warm-up too."""
+
+    def start_episode(self, which: Sequence[int]) -> None:  # noqa: B027 - most algorithms have nothing to do
+        """Called for the seeds `which` before the first step of each of their training episodes, in warm-up too.
+
+        It is for what an episode starts with, as the noise of an Ornstein-Uhlenbeck process. Draw from
+        `self.exploration` with `which=which`, write to the rows `which` alone, and give the tensor to `memory()`: a
+        resumed training goes on within the episode, without another call. Where a rollout starts too, `start_rollout`
+        follows. Episodes of evaluations have no call.
+        """
 
     def statistics(self) -> dict[str, Tensor]:
-        """Measures of the last gradient step: name -> (seeds,)."""
+        """Measures of the last gradient steps, for training.csv: name -> (seeds,), the same names in every call.
+
+        Called beside an evaluation, after the first gradient step. A training that resumes may ask before its next
+        gradient step, so keep the numbers in `memory()` or compute them from it.
+        """
         return {}
 
     @property

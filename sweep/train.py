@@ -16,14 +16,13 @@ from algos import ALGORITHMS, setting_keys
 from core.config import RUN_KEYS, Config, saved_settings
 from core.trainer import Trainer
 from core.words import ConfigError, parse_words
-from envs import TASKS, TOLERANCE
 from store.checkpoint import Checkpoint, CheckpointFolder, FormatError, group_checkpoints
-from store.files import one_line
 from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
 from store.interrupt import Interrupted
 from store.lock import run_lock
 from store.provenance import describe_environment
 from sweep.cells import Cell, make_cells
+from sweep.check import check_training
 from sweep.exit import Exit, stoppable
 
 
@@ -58,7 +57,7 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
     if config.device.startswith("cuda:"):
         torch.cuda.set_device(config.device)
     check_robot(config.env)
-    check_constraint(config.env, config.simulator)
+    check_training(config, partial(make_env, config.env, config.simulator))
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     if config.steps <= config.learning_starts:
         print(
@@ -144,23 +143,6 @@ def check_robot(task: str) -> None:
         envs.check_robot(TASKS[task].robot, steps=10)
     except envs.RobotError as error:
         raise ConfigError(f"the robot of {task} does not work: {error}") from error
-
-
-def check_constraint(task: str, simulator: str | None) -> None:
-    """Raise ConfigError if the constraint of `task` does not work on its robot, or if the simulator is not there."""
-    constraint = TASKS[task].constraint
-    env = make_env(task, simulator)
-    try:
-        obs = torch.from_numpy(env.reset(seed=0)[0]).float().unsqueeze(0)
-        if constraint.dim != env.robot.action_dim:
-            raise ValueError(f"it is for {constraint.dim} action coordinates, the robot has {env.robot.action_dim}")
-        action = constraint.project(obs, torch.ones(1, constraint.dim))
-        if action.shape != (1, constraint.dim) or not constraint.violation(obs, action).item() <= TOLERANCE:
-            raise ValueError(f"it projects (1, ..., 1) to {action.tolist()} at a first observation")
-    except Exception as error:  # the constraint may be the user's own code
-        raise ConfigError(f"the constraint of {task} does not work: {one_line(error)}") from error
-    finally:
-        env.close()
 
 
 def _device_name(device: str) -> str:

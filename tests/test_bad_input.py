@@ -198,10 +198,11 @@ def test_a_constraint_that_breaks_down_later_says_where(capsys, tmp_path, monkey
     def bound(obs):
         calls.append(len(obs))
         # Projections and the environment's checks take turns; the first call that finds no set is a projection's.
-        return ones(obs, 1) * (1.0 if len(calls) < 41 else -5.0)
+        return ones(obs, 1) * (1.0 if len(calls) < 42 else -5.0)
 
     calls = []
     monkeypatch.setitem(TASKS, "R+X", Task(Reacher, rows(lambda o: ones(o, 1, 2), bound), "a task", "a formula", 20))
-    assert run_command(f"algo=DPre env=R+X {WORDS} results={tmp_path}".split()) == 2
-    assert capsys.readouterr().err.splitlines()[-1].endswith("the set is empty")
+    assert run_command(f"algo=DPre env=R+X {WORDS} results={tmp_path}".split()) == 3
+    assert "failed at step" in (line := capsys.readouterr().err.splitlines()[-1])
+    assert "the set is empty, at observation [" in line
     assert not list(tmp_path.rglob("*.lock"))

@@ -33,6 +33,7 @@ import tables
 from core.words import ConfigError, known_name, parse_words, split_names
 from plots import style
 from plots.aggregates import aggregate, draw_aggregates, improvement_table, mean_table
+from plots.conflicts import keep_apart
 from plots.figures import draw_curves
 from plots.grouping import DAGGER, Groups, group_runs, list_diverged, list_left_out
 from plots.paper import COLORS, order_algos, order_tasks
@@ -94,9 +95,12 @@ def _read(root: Path, options: dict[str, str]) -> Groups:
     algos = split_names(f"algo in {root}", options.get("algo", "all"), algos, of_paper)
     runs, problems = read_results(root, tasks, algos)
     runs += [published.run for published in read_published(root, tasks, algos)]
+    runs, conflicts = keep_apart(runs)
     groups, repeated = group_runs(runs)
     for problem in problems + repeated:
         print(f"skipped {problem}", file=sys.stderr)
+    for conflict in conflicts:
+        print(f"note: {conflict}", file=sys.stderr)
     if not runs:
         raise ConfigError(f"no readable runs of these tasks and algorithms in {root}")
     return groups

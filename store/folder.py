@@ -2,6 +2,7 @@
 
     results/<task>/<variant>/seed=<n>/
         config.yaml      the resolved configuration
+        definition.json  what the task and the algorithm stood for, as text; see store/definition.py
         info.json        versions, git commit, machine, threads, command, start time; again for each resumption
         evaluations.csv  step,return_mean,return_1,...,return_k,seconds: one row an evaluation, appended
         training.csv     step and the algorithm's own measures (SAC: temperature, entropy; TD3: losses, mean Q)
@@ -96,6 +97,15 @@ def read_settings(folder: str | Path) -> dict[str, Any]:
         return {}
 
 
+def read_definition(folder: str | Path) -> dict[str, dict[str, str]] | None:
+    """The definition of the task and of the algorithm in the run in `folder`; None where it has none."""
+    try:
+        content = _parse(Path(folder, "definition.json"), json.loads)
+        return {part: dict(content[part]) for part in ("task", "algorithm")}
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
 def lockstep_group(folder: str | Path) -> tuple[int, ...]:
     """The seeds that the run in `folder` started with, from its info.json; empty if they are not there."""
     try:
@@ -118,6 +128,7 @@ class RunWriter:
         info: Mapping[str, Any],
         eval_episodes: int,
         replace_finished: bool = False,
+        definition: Mapping[str, Any] | None = None,
     ):
         self.folder, self.config = Path(folder), dict(config)
         self.eval_episodes = eval_episodes
@@ -130,10 +141,16 @@ class RunWriter:
         (self.folder / "evaluations.csv").write_text(",".join(columns) + "\n")
         self._save_info(info)
         self._save_config()
+        self._save_definition(definition)
 
     @classmethod
     def resume(
-        cls, folder: str | Path, config: Mapping[str, Any], info: Mapping[str, Any], eval_episodes: int
+        cls,
+        folder: str | Path,
+        config: Mapping[str, Any],
+        info: Mapping[str, Any],
+        eval_episodes: int,
+        definition: Mapping[str, Any] | None = None,
     ) -> RunWriter:
         """The writer of a run that resumes. Adds `info` to info.json. The trainer calls `restore_tables`."""
         writer = cls.__new__(cls)
@@ -144,6 +161,7 @@ class RunWriter:
             first = {}
         writer._save_info(first | {"resumed": [*first.get("resumed", []), dict(info)]})
         writer._save_config()
+        writer._save_definition(definition)
         return writer
 
     def tables(self) -> dict[str, str]:
@@ -163,6 +181,10 @@ class RunWriter:
 
     def _save_config(self) -> None:
         self._replace("config.yaml", yaml.safe_dump(self.config, sort_keys=False))
+
+    def _save_definition(self, definition: Mapping[str, Any] | None) -> None:
+        if definition is not None:
+            self._replace("definition.json", json.dumps(definition, indent=2) + "\n")
 
     def _replace(self, name: str, text: str) -> None:
         replace_file(self.folder / name, lambda file: file.write(text.encode()))

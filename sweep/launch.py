@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from core.words import ConfigError
 from sweep.cells import Cell
+from sweep.definition import check_definitions
 from sweep.exit import Exit
 from sweep.local import run_queue
 from sweep.plan import describe_plan, make_plan, memory_warning
@@ -37,6 +38,7 @@ def launch(sweep: Sweep, cells: Sequence[Cell], threads_given: bool, stop_if_ask
         raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
     else:
         check_gpus(sweep, settings.device)
+    check_definitions(cells)
     entries = make_plan(cells, job_states(cells))
     if sweep.settings.dry:
         print(describe_plan(entries, jobs))

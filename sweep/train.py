@@ -16,6 +16,7 @@ from algos import ALGORITHMS, setting_keys
 from core.config import RUN_KEYS, Config, saved_settings
 from core.trainer import Trainer
 from core.words import ConfigError, parse_words
+from envs import TASKS
 from store.checkpoint import Checkpoint, CheckpointFolder, FormatError, group_checkpoints
 from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
 from store.interrupt import Interrupted
@@ -23,6 +24,7 @@ from store.lock import run_lock
 from store.provenance import describe_environment
 from sweep.cells import Cell, make_cells
 from sweep.check import check_training
+from sweep.definition import check_definition, define
 from sweep.exit import Exit, stoppable
 
 
@@ -52,6 +54,7 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
     Prints each result and its folder. Returns whether every seed has a result.
     """
     config, folders = cell.config, dict(zip(cell.seeds, cell.folders, strict=True))
+    definition = define(config.env, config.algo)  # before its objects are used, which may change them
     torch.set_num_threads(config.threads)
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
@@ -68,6 +71,9 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
         for folder in folders.values():
             locks.enter_context(run_lock(folder))
         ended = {seed for seed, folder in folders.items() if has_ended(folder) and not config.overwrite}
+        for folder in folders.values():
+            if not config.overwrite and (has_ended(folder) or CheckpointFolder(folder).folder.exists()):
+                check_definition(folder, definition)
         for seed in sorted(ended):
             print(f"{folders[seed]}: {_end_of(folders[seed])} (overwrite=true starts it again and keeps this one)")
         groups, fresh = ([], list(folders)) if config.overwrite else _find_checkpoints(folders, ended)
@@ -78,7 +84,7 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
                 for seed in group:
                     CheckpointFolder(folders[seed]).remove()
             else:
-                _resume(config, folders, group, ended, info, stop_if_asked)
+                _resume(config, folders, group, ended, info, definition, stop_if_asked)
         if fresh:
             info["lockstep"] = fresh
             writers = [
@@ -88,6 +94,7 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
                     info,
                     config.eval_episodes,
                     replace_finished=config.overwrite,
+                    definition=definition,
                 )
                 for seed in fresh
             ]
@@ -177,6 +184,7 @@ def _resume(
     group: dict[int, Checkpoint],
     ended: set[int],
     info: dict[str, Any],
+    definition: dict[str, Any],
     stop_if_asked: Callable[[], None],
 ) -> None:
     """Resume the training from the checkpoints of `group`, which were written together."""
@@ -188,7 +196,8 @@ def _resume(
     writers = []
     for seed in seeds:
         resumed = info | {"step": group[seed].step, "lockstep": seeds}
-        writers.append(RunWriter.resume(folders[seed], saved_settings(config, seed), resumed, config.eval_episodes))
+        settings = saved_settings(config, seed)
+        writers.append(RunWriter.resume(folders[seed], settings, resumed, config.eval_episodes, definition))
         if seed not in ended:
             print(f"{folders[seed]}: resuming from step {group[seed].step}")
     if len(seeds) < len(before):

@@ -79,6 +79,14 @@ def status_of(pid):
         return {}
 
 
+def birth_of(pid):
+    """When the process started, in ticks of the clock; None once it is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+
+
 class Fault:
     """Something that happens to a cell's job between a tenth and half of its steps.
 
@@ -91,7 +99,7 @@ class Fault:
 
     def __init__(self, cell, root, jobs):
         self.cell, self.root, self.jobs = cell, root, jobs
-        self.stage, self.first, self.struck, self.senders = 0, None, None, []
+        self.stage, self.first, self.struck, self.born, self.senders = 0, None, None, None, []
 
     @property
     def job(self):
@@ -123,7 +131,7 @@ class Fault:
             self.strike()
             self.stage = 1
         elif self.stage == 1:
-            pending = int(status_of(self.struck).get("ShdPnd", "0"), 16)
+            pending = 0 if self.is_gone() else int(status_of(self.struck).get("ShdPnd", "0"), 16)
             if self.awaited and all(pending & 1 << (signum - 1) for signum in self.awaited):
                 for sender in self.senders:
                     sender.kill()
@@ -131,6 +139,10 @@ class Fault:
                 os.kill(self.struck, signal.SIGCONT)  # not every Slurm does that itself
             if self.follow_up():
                 self.stage = 2
+
+    def is_gone(self):
+        """Whether the struck process has ended. Another one may have its number by now."""
+        return birth_of(self.struck) != self.born
 
     def is_in_reach(self):
         return STEPS // 10 <= saved_step(self.cell.folders[0]) <= STEPS // 2
@@ -146,7 +158,7 @@ class Fault:
             return False
         if not pid or not self.is_in_reach():
             return False
-        self.struck = pid
+        self.struck, self.born = pid, birth_of(pid)
         os.kill(pid, signal.SIGSTOP)
         while not status_of(pid).get("State", "T").startswith("T"):
             time.sleep(0.01)
@@ -191,7 +203,7 @@ class Preempted(Fault):
         self.send("TERM", "USR2")
 
     def follow_up(self):
-        return not status_of(self.struck)
+        return self.is_gone()
 
 
 class OutOfTime(Fault):
@@ -203,7 +215,7 @@ class OutOfTime(Fault):
         pass
 
     def follow_up(self):
-        return not status_of(self.struck)
+        return self.is_gone()
 
 
 def test_cells_that_are_killed_preempted_or_out_of_time_end_as_on_one_machine(tmp_path, slurm, capsys):

@@ -1,0 +1,57 @@
+"""Runs of one task or algorithm by name that were trained on different definitions of it: kept apart, and named."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+
+from store.definition import Description, differences, is_own
+from store.folder import Run, read_definition
+
+_UNKNOWN = "unknown"
+
+
+def keep_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """The runs, and a line for each task and algorithm with several definitions.
+
+    Runs of those have one setting more, `task_definition` or `algorithm_definition`, which separates them in all tables
+    and figures. A run without a definition is older than definitions. It counts as one of the project's own task.
+    """
+    definitions = [read_definition(run.folder) for run in runs]
+    extra: list[dict[str, str]] = [{} for _ in runs]
+    notes = []
+    for part in ("task", "algorithm"):
+        by_name = defaultdict(list)
+        for i, run in enumerate(runs):
+            by_name[run.task if part == "task" else run.algo].append(i)
+        for name, members in by_name.items():
+            marks = {i: _mark((definitions[i] or {}).get(part)) for i in members}
+            known = [i for i in members if marks[i] != _UNKNOWN]
+            own = all(is_own(definitions[i][part]) for i in known)  # type: ignore[index]
+            kinds: dict[str, int] = {}
+            for i in known if own else members:
+                kinds.setdefault(marks[i], i)
+            if len(kinds) < 2:
+                continue
+            for i in members:
+                extra[i][f"{part}_definition"] = marks[i]
+            i, *others = kinds.values()
+            for j in others:
+                one, other = definitions[i], definitions[j]
+                what = differences(one[part], other[part]) if one and other else "one of them is unknown"
+                notes.append(f"{name} has two definitions: {what} (then {runs[i].folder}, now {runs[j].folder})")
+    apart = [
+        replace(run, overrides=run.overrides | more, config=run.config | more) if more else run
+        for run, more in zip(runs, extra, strict=True)
+    ]
+    return apart, notes
+
+
+def _mark(description: Description | None) -> str:
+    """A short name of a definition."""
+    if description is None:
+        return _UNKNOWN
+    return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()[:6]

@@ -1,0 +1,64 @@
+"""Whose code a module or a file is: the project's, a library's, or the user's."""
+
+from __future__ import annotations
+
+import site
+import sys
+import sysconfig
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+_PROJECT = {"algos", "bench", "constraints", "core", "envs", "plot", "plots", "run", "store", "sweep", "tables"}
+
+
+def is_project(module: str) -> bool:
+    """Whether the module of this name is one of the project's packages or commands."""
+    return module.partition(".")[0] in _PROJECT
+
+
+@cache
+def user_file(module: str) -> Path | None:
+    """The source file of a loaded module that is neither the project's nor a library's; None for those two."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if is_project(module) or not file:
+        return None
+    path = Path(file).resolve()
+    if path.suffix != ".py" or path in _commands() or any(folder in path.parents for folder in _libraries()):
+        return None
+    return path
+
+
+def module_of(value: Any) -> str:
+    """The name of the module that defines a function or a class; empty if it tells none."""
+    return getattr(value, "__module__", None) or ""
+
+
+def is_user(value: Any) -> bool:
+    """Whether a function or a class is the user's own code. One that was typed at a prompt is, too."""
+    module = module_of(value)
+    return user_file(module) is not None or (module == "__main__" and not _main_is_command())
+
+
+def user_files() -> list[Path]:
+    """The source files of all loaded modules that are neither the project's nor a library's."""
+    return sorted({file for module in list(sys.modules) if (file := user_file(module))})
+
+
+def _main_is_command() -> bool:
+    file = getattr(sys.modules["__main__"], "__file__", None)
+    return bool(file) and Path(file).resolve() in _commands()
+
+
+@cache
+def _commands() -> set[Path]:
+    return {ROOT / "run.py", ROOT / "plot.py"}
+
+
+@cache
+def _libraries() -> set[Path]:
+    known = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    known |= {*site.getsitepackages(), site.getusersitepackages(), str(Path(sys.executable).parent)}
+    # An environment may lie below the standard library's folder, but never below the user's sources.
+    return {Path(folder).resolve() for folder in known}

@@ -9,6 +9,7 @@ from constraints.base import Constraint, Ellipse, ExplicitSet
 from constraints.ellipse import ellipse_gauge_gradient
 from constraints.gauge import largest_gauge
 from constraints.jacobian import JacobianProduct
+from constraints.sample import uniform_in_ball
 
 
 class Ball(Constraint):
@@ -49,3 +50,6 @@ class Ball(Constraint):
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         # The box is never active.
         return largest_gauge(direction, *self._gauge_gradients(obs, direction, center))
+
+    def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+        return self.radius * uniform_in_ball((*obs.shape[:-1], count, self.dim), obs, generator)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from constraints.base import Constraint, ExplicitSet
 from constraints.jacobian import JacobianProduct, deflated_jacobian
+from constraints.sample import uniform
 
 
 class Box(Constraint):
@@ -28,3 +30,6 @@ class Box(Constraint):
 
     def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         return gradient.sign()
+
+    def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+        return 2.0 * uniform((*obs.shape[:-1], count, self.dim), obs, generator) - 1.0

@@ -10,11 +10,13 @@ from constraints import Constraint
 from envs.constrained import TOLERANCE, ActionConstrainedEnv, InfeasibleActionError, find_task, step_together
 from envs.robot import Robot, UnavailableError
 from envs.tasks import TASKS, Task
+from envs.wrapper import Constrained
 
 __all__ = [
     "TASKS",
     "TOLERANCE",
     "ActionConstrainedEnv",
+    "Constrained",
     "InfeasibleActionError",
     "Robot",
     "Task",

@@ -51,6 +51,8 @@ def constraint(task: str) -> Constraint:
     return find_task(task).constraint
 
 
+# Any task, those added to `TASKS` as well: gymnasium.make("acrl/Task-v0", task="R+CBF").
+gymnasium.register("acrl/Task-v0", entry_point="envs.constrained:ActionConstrainedEnv")
 for _name in TASKS:
     gymnasium.register(
         f"acrl/{_name.replace('+', '-')}-v0",

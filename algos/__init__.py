@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import Field, dataclass, field, fields, make_dataclass
+from dataclasses import Field, dataclass, field, fields, make_dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from algos.nfwpo import NFWPO
+from algos.policy import Policy, constraint_of, restore, settings_of
 from algos.sac import SAC
 from algos.td3 import TD3
 from constraints import Constraint
@@ -124,3 +126,22 @@ def setting_keys() -> dict[str, Field]:
 def saved_config(settings: Mapping[str, Any]) -> Config:
     """The configuration in a run's config.yaml, whose algorithm must be one of `ALGORITHMS`."""
     return restore_settings(ALGORITHMS[settings["algo"]].config_class, settings)
+
+
+def load_policy(folder: str | Path, which: str = "best") -> Policy:
+    """The policy of the run in `folder`, which is finished or not: observations (n,) or (m, n) -> executed actions.
+
+    `which`: "best" has the parameters of the best evaluation so far, "last" those at the end of the training or, while
+    it is unfinished, of its newest checkpoint. Everything is on the CPU.
+
+    Raises ConfigError, a ValueError, for another `which`, for a folder without a run or without these parameters, and
+    for an algorithm or a task that is not known. Import the file that defines your own before.
+    """
+    folder = Path(folder).expanduser()
+    settings = settings_of(folder)
+    known_name("algorithm", settings["algo"], ALGORITHMS)
+    config = replace(saved_config(settings), device="cpu")
+    constraint, obs_dim = constraint_of(config.env)
+    agent = ALGORITHMS[config.algo].build(config, constraint, obs_dim, config.seeds)
+    restore(agent, folder, which)
+    return Policy(agent, constraint)

@@ -11,6 +11,7 @@ from constraints.coefficients import Bound
 from constraints.ellipse import DiagonalEllipse, ellipse_gauge_gradient
 from constraints.gauge import largest_gauge
 from constraints.jacobian import JacobianProduct
+from constraints.sample import uniform_in_ball
 
 
 class _InBox(NamedTuple):
@@ -64,3 +65,8 @@ class Ball(DiagonalEllipse):
         if self._in_box is None:
             return super()._gauge_and_gradient(at, direction, center)
         return largest_gauge(direction, ellipse_gauge_gradient(direction, direction, center, center, at.bound))
+
+    def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+        if self._in_box is None:
+            return super()._sample(obs, count, generator)
+        return self._in_box.bound**0.5 * uniform_in_ball((*obs.shape[:-1], count, self.dim), obs, generator)

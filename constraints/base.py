@@ -23,6 +23,7 @@ from constraints.implicit import Boundary, Solver, differentiable_projection, te
 from constraints.jacobian import JacobianProduct, with_jacobian
 from constraints.numerics import is_traced, keep_nan, one_where_zero, with_gradient
 from constraints.ray import Ray
+from constraints.sample import hit_and_run
 
 AT_FACE = 1.0 - 1e-9
 """The box holds a coordinate of a projection that is at least this large: rounding may have moved it off the face."""
@@ -115,6 +116,17 @@ class Constraint(ABC):
     def _center(self, at: Any) -> Tensor | None:
         """Interior point (..., d), or a single one (d,) for every obs; None for the origin."""
         return None
+
+    def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+        """Points (..., count, d), uniform in the set. A set with a closed form overrides this."""
+        repeated = obs.unsqueeze(-2)
+        return hit_and_run(
+            lambda direction, point: self.gauge(repeated, direction, point),
+            lambda gradient: self.linear_oracle(obs, gradient),
+            self.center(obs),
+            count,
+            generator,
+        )
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         """The set's rows and ellipses. A part of an `Intersection` must have them; TypeError where it does not."""
@@ -243,6 +255,18 @@ class Constraint(ABC):
         # Only the direction matters. At length 1, the squares of tiny gradients stay above zero.
         gradient64 = gradient64 / one_where_zero(gradient64.abs().amax(-1, keepdim=True))
         return keep_nan(self._linear_oracle(at, gradient64), gradient64).to(gradient.dtype)
+
+    def sample(self, obs: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
+        """Feasible points (..., count, d), uniform in each set A(obs), in the dtype of `obs`.
+
+        Random numbers come from `generator`, or from PyTorch's default one. ValueError for count < 1.
+        """
+        if count < 1:
+            raise ValueError(f"count must be at least 1, got {count}")
+        if not obs.is_floating_point():
+            raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
+        with torch.no_grad():
+            return self._sample(obs.detach().double(), count, generator).to(obs.dtype)
 
     # ---------------------------------------------------------------- shared pieces
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from constraints.base import Constraint, ExplicitSet
 from constraints.jacobian import JacobianProduct, deflated_jacobian
+from constraints.sample import uniform
 
 
 class Box(Constraint):
@@ -33,3 +35,6 @@ class Box(Constraint):
 
     def _linear_oracle(self, at: Any, gradient: Tensor) -> Tensor:
         return gradient.sign()
+
+    def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+        return 2.0 * uniform((*obs.shape[:-1], count, self.dim), obs, generator) - 1.0

@@ -17,11 +17,13 @@ from envs.gymnasium_robot import GymnasiumRobot
 from envs.registry import Task, gymnasium_id
 from envs.robot import Robot, RobotError, UnavailableError
 from envs.tasks import TASKS
+from envs.wrapper import Constrained
 
 __all__ = [
     "TASKS",
     "TOLERANCE",
     "ActionConstrainedEnv",
+    "Constrained",
     "GymnasiumRobot",
     "InfeasibleActionError",
     "Robot",
@@ -64,3 +66,7 @@ def make(
 def constraint(task: str) -> Constraint:
     """The `constraints.Constraint` of `task` (a key of `TASKS`); ValueError for an unknown task."""
     return find_task(task).constraint
+
+
+# Any task by its name: gymnasium.make("acrl/Task-v0", task="R+CBF").
+gymnasium.register("acrl/Task-v0", entry_point="envs.constrained:ActionConstrainedEnv")

@@ -1,46 +1,96 @@
-"""README's table of the cells that were trained at full length: `python -m plots.reproduced docs/full-runs`."""
+"""The tables of what was trained at full length, in README and docs/results.md: `python -m plots.reproduced`.
+
+It reads docs/data and replaces both tables. A test compares them with the data.
+"""
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from plots.grouping import Condition, group_runs, reward_statistics
+import numpy as np
+
+from plots.grouping import group_runs, statistic
 from plots.paper import DEFAULT_BATCH, Statistic, order_algos, order_tasks, read_paper
 from plots.rewards import decimals
-from store.folder import read_results
+from plots.starts import adjusted_returns, is_on_reacher
+from store.folder import Run
+from store.published import read_published
 from tables import MISSING
 
-README = Path(__file__).parents[1] / "README.md"
-BEGIN, END = "<!-- python -m plots.reproduced docs/full-runs -->\n", "<!-- end -->\n"
+ROOT = Path(__file__).parents[1]
+DATA = ROOT / "docs" / "data"
+BEGIN, END = "<!-- made by: python -m plots.reproduced -->\n", "<!-- end -->\n"
+
+Cells = dict[str, dict[str, list[Run]]]
+"""Runs by task and algorithm."""
 
 
-def reproduced_table(root: str | Path) -> str:
-    """The finished runs below `root` at the paper's own settings, beside the paper's means, as a Markdown table.
+def read_cells(root: str | Path) -> Cells:
+    """The finished runs published in `root` that have the paper's own settings.
 
-    A row an algorithm, a column a task. Raises ValueError if a run cannot be read or repeats another.
+    Raises ValueError if a file is corrupt, a run repeats another, or a cell mixes settings.
     """
-    runs, problems = read_results(root)
-    groups, repeated = group_runs(run for run in runs if not run.overrides)
-    if problems or repeated:
-        raise ValueError("; ".join(problems + repeated))
-    by_condition = reward_statistics(groups)
-    ours = {task: by_condition[Condition(task, "")] for task, settings in by_condition if not settings}
-    tasks = order_tasks(ours)
-    rows = [["", *tasks], ["---", *["---"] * len(tasks)]]
-    for algo in order_algos({algo for row in ours.values() for algo in row}):
-        rows.append([algo, *(_cell(ours[task].get(algo), task, algo) for task in tasks)])
+    runs = [published.run for published in read_published(root)]
+    groups, repeated = group_runs(run for run in runs if not run.overrides and run.finished)
+    mixed = [f"{condition.label}: settings differ within a cell" for condition in groups if condition.settings]
+    if repeated or mixed:
+        raise ValueError("; ".join(repeated + mixed))
+    return {condition.task: groups[condition] for condition in groups}
+
+
+def overview(cells: Cells) -> str:
+    """README's table: a row an algorithm, a column a task, our mean beside the paper's."""
+    tasks = order_tasks(cells)
+    rows = [["", *tasks], ["---"] * (len(tasks) + 1)]
+    for algo in order_algos({algo for by_algo in cells.values() for algo in by_algo}):
+        row = [algo]
+        for task in tasks:
+            if runs := cells[task].get(algo):
+                ours, theirs = _results(runs), read_paper().get((task, DEFAULT_BATCH, algo))
+                digits = decimals(stat.mean for stat in (ours, theirs) if stat)
+                row.append(f"**{_text(ours, digits)}** (n={ours.n}) / {_text(theirs, digits)}")
+            else:
+                row.append(MISSING)
+        rows.append(row)
+    return _markdown(rows)
+
+
+def details(cells: Cells) -> str:
+    """The table of docs/results.md: a row a cell, with the results on Reacher adjusted for their starts."""
+    rows = [
+        ["task", "algorithm", "seeds", "final result", "adjusted for the starts", "paper"],
+        ["---"] * 3 + ["---:"] * 3,
+    ]
+    for task in order_tasks(cells):
+        for algo in order_algos(cells[task]):
+            runs = cells[task][algo]
+            ours, theirs = _results(runs), read_paper().get((task, DEFAULT_BATCH, algo))
+            digits = decimals(stat.mean for stat in (ours, theirs) if stat)
+            adjusted = None
+            if is_on_reacher(runs[0]):
+                adjusted = statistic([float(np.mean(adjusted_returns(run))) for run in runs])
+            seeds = ", ".join(str(run.seed) for run in runs)
+            rows.append([task, algo, seeds, *(_text(stat, digits) for stat in (ours, adjusted, theirs))])
+    return _markdown(rows)
+
+
+def _results(runs: Sequence[Run]) -> Statistic:
+    return statistic([float(run.result["return_mean"]) for run in runs])
+
+
+def _text(stat: Statistic | None, digits: int) -> str:
+    if stat is None:
+        return MISSING
+    return f"{stat.mean:.{digits}f}" + (f" ± {stat.se:.{digits}f}" if stat.n > 1 else "")
+
+
+def _markdown(rows: Sequence[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
-def _cell(ours: Statistic | None, task: str, algo: str) -> str:
-    if ours is None:
-        return MISSING
-    theirs = read_paper().get((task, DEFAULT_BATCH, algo))
-    digits = decimals([ours.mean] if theirs is None else [ours.mean, theirs.mean])
-    paper = MISSING if theirs is None else f"{theirs.mean:.{digits}f} ± {theirs.se:.{digits}f}"
-    error = f" ± {ours.se:.{digits}f}" if ours.n > 1 else ""
-    return f"**{ours.mean:.{digits}f}**{error} (n={ours.n}) / {paper}"
+TABLES = {ROOT / "README.md": overview, ROOT / "docs" / "results.md": details}
+"""The table of each document."""
 
 
 def replace_table(text: str, table: str) -> str:
@@ -53,6 +103,5 @@ def replace_table(text: str, table: str) -> str:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit("usage: python -m plots.reproduced FOLDER")
-    README.write_text(replace_table(README.read_text(), reproduced_table(sys.argv[1])))
+    for path, make in TABLES.items():
+        path.write_text(replace_table(path.read_text(), make(read_cells(DATA))))

@@ -1,7 +1,7 @@
 """The examples in README and docs run as printed, and the docs describe what is there."""
 
 import re
-import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,10 +9,11 @@ import pytest
 from algos import ALGORITHMS, PAPER
 from envs import TASKS
 from plots.paper import read_paper
-from plots.reproduced import README, replace_table, reproduced_table
-from store.folder import read_results
+from plots.reproduced import DATA, TABLES, overview, read_cells, replace_table
+from store.published import PublishedRun, read_published, write_published
 
 ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 EXAMPLES = [(page, code) for page in PAGES for code in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)]
 SHORTENED = " steps=300 learning_starts=100 batch_size=8 eval_episodes=1 final_episodes=1"
@@ -55,30 +56,35 @@ def test_the_tables_have_every_task_and_algorithm_of_the_paper_and_no_unknown_on
     assert {*PAPER, *(task for task, _, _ in read_paper())} <= names <= {*ALGORITHMS, *TASKS}
 
 
-def test_the_table_of_what_is_reproduced_is_that_of_the_runs():
-    assert replace_table(README.read_text(), reproduced_table(ROOT / "docs" / "full-runs")) == README.read_text()
+@pytest.mark.parametrize("path", TABLES, ids=lambda path: path.stem)
+def test_the_tables_of_what_is_reproduced_are_those_of_the_runs(path):
+    table = TABLES[path](read_cells(DATA))
+    assert replace_table(path.read_text(), table) == path.read_text(), "run python -m plots.reproduced"
 
 
 def test_a_run_with_other_settings_or_without_result_is_not_reproduced(tmp_path):
-    runs = ROOT / "docs" / "full-runs" / "R+L2"
-    for source, target in (("DPro", "DPro"), ("DPre", "DPre,batch_size=16"), ("DAlpha", "DAlpha")):
-        shutil.copytree(runs / source, tmp_path / "R+L2" / target)
-    (tmp_path / "R+L2" / "DAlpha" / "seed=0" / "result.json").unlink()
-    assert reproduced_table(tmp_path).splitlines()[2:] == ["| DPro | **17.18** (n=1) / -4.65 ± 0.59 |"]
+    runs = {published.run.algo: published for published in read_published(DATA, ["R+L2"], ["DPro", "DPre", "DAlpha"])}
+    pro, pre, alpha = runs["DPro"], runs["DPre"], runs["DAlpha"]
+    other = replace(pre.run, variant="DPre,batch_size=16", overrides={"batch_size": "16"})
+    unfinished = replace(alpha.run, result=None)
+    write_published(tmp_path / "R+L2", [pro, PublishedRun(other, pre.info), PublishedRun(unfinished, alpha.info)])
+    cells = read_cells(tmp_path)
+    assert {task: list(by_algo) for task, by_algo in cells.items()} == {"R+L2": ["DPro"]}
+    result = pro.run.result["return_mean"]
+    assert overview(cells).splitlines()[2:] == [f"| DPro | **{result:.2f}** (n=1) / -4.65 ± 0.59 |"]
+
+
+def test_a_cell_of_mixed_settings_is_refused(tmp_path):
+    run = next(published for published in read_published(DATA, ["R+L2"]) if not published.run.overrides)
+    other = replace(run.run, seed=run.run.seed + 1000, config=run.run.config | {"gamma": 0.5})
+    write_published(tmp_path / "R+L2", [run, PublishedRun(other, run.info)])
+    with pytest.raises(ValueError, match="settings differ"):
+        read_cells(tmp_path)
 
 
 def test_a_text_without_a_place_for_the_table_is_refused():
     with pytest.raises(ValueError, match="no table between"):
         replace_table("no marks", "| |\n")
-
-
-def test_the_results_page_has_the_numbers_of_the_runs():
-    page = (ROOT / "docs" / "results.md").read_text()
-    runs, _ = read_results(ROOT / "docs" / "full-runs", ["R+L2"])
-    for run in runs:
-        late = run.evaluations.return_mean[run.evaluations.step > 200_000]
-        assert len(late) == 20
-        assert f"| {run.algo} | {run.result['return_mean']:.2f} | {late.mean():.2f} |" in page
 
 
 def test_the_tree_of_the_code_is_the_one_on_disk():

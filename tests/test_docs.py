@@ -49,14 +49,14 @@ def test_the_afternoon_happens_as_printed(tmp_path):
             done = subprocess.run(command, shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True)
             assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
 
-    results = [json.loads(path.read_text()) for path in (tmp_path / "afternoon").glob("*/*/*/result.json")]
+    results = [json.loads(path.read_text()) for path in (tmp_path / "results").glob("*/*/*/result.json")]
     assert len(results) == 27  # four algorithms and two tasks, one algorithm with a second setting; three seeds
     assert all(result["steps"] == 300 and result["largest_violation"] <= 1e-6 for result in results)
     for pattern in re.findall(r"^\| (`(?:tables|figures)/[^|]*) \|", page, re.MULTILINE):
         for name in re.findall(r"`((?:tables|figures)/[^`,.]+)", pattern):
-            assert list((tmp_path / "afternoon").glob(f"{name}*")), name
+            assert list((tmp_path / "results").glob(f"{name}*")), name
     for table in ("rewards", "tasks", "hyperparameters"):
-        latex = (tmp_path / "afternoon" / "tables" / f"{table}.tex").read_text()
+        latex = (tmp_path / "results" / "tables" / f"{table}.tex").read_text()
         assert ("R+P" if table == "tasks" else "DNear") in latex
 
 

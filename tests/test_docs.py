@@ -1,5 +1,6 @@
 """What the documentation says can be done as printed: the afternoon's commands, all links, all figures."""
 
+import configparser
 import json
 import os
 import re
@@ -10,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -88,6 +90,15 @@ def test_every_module_that_the_docs_run_is_there():
     for page in PAGES:
         for module in re.findall(r"python (?:-m )?((?:bench|plots)[/.]\w+)", page.read_text()):
             assert (ROOT / (module.replace(".", "/").removesuffix("/py") + ".py")).is_file(), module
+
+
+def test_the_citation_file_cites_the_paper_and_this_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    settings = configparser.ConfigParser()
+    settings.read(ROOT / "setup.cfg")
+    assert citation["version"] == settings["metadata"]["version"]
+    doi = citation["preferred-citation"]["doi"]
+    assert f"https://doi.org/{doi}" in (ROOT / "README.md").read_text()
 
 
 def test_no_page_loads_anything_from_elsewhere():

@@ -141,7 +141,7 @@ def make_env(task: str, simulator: str | None) -> envs.ActionConstrainedEnv:
 def check_robot(task: str) -> None:
     """Raise ConfigError if the robot of `task` does not keep the protocol of `envs.Robot` in a few steps."""
     try:
-        envs.check_robot(TASKS[task].robot, steps=10)
+        envs.check_robot(envs.TASKS[task].robot, steps=10)
     except envs.RobotError as error:
         raise ConfigError(f"the robot of {task} does not work: {error}") from error
 

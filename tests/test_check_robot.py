@@ -338,6 +338,14 @@ def test_training_names_the_mistake_before_it_starts(mistake, tmp_path, capsys, 
     assert not list(tmp_path.iterdir())
 
 
+def test_a_group_of_hyperparameters_that_no_algorithm_has(tmp_path, capsys, monkeypatch):
+    robot = type("Misspelt", (Good,), {"hyperparameters": "Hoper"})
+    monkeypatch.setitem(envs.TASKS, "misspelt", envs.Task(robot, Ball(0.1, 1), "", "", 100))
+    assert run_command(f"algo=DPre env=misspelt results={tmp_path}".split()) == 2
+    line = capsys.readouterr().err
+    assert "unknown hyperparameters of Misspelt 'Hoper'; did you mean Hopper?" in line and line.count("\n") == 1
+
+
 # ---------------------------------------------------------------- robots from Gymnasium
 
 

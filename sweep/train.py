@@ -15,7 +15,7 @@ import envs
 from algos import ALGORITHMS, setting_keys
 from core.config import RUN_KEYS, Config, saved_settings
 from core.trainer import Trainer
-from core.words import ConfigError, parse_words
+from core.words import ConfigError, known_name, parse_words
 from envs import TASKS
 from store.checkpoint import Checkpoint, CheckpointFolder, FormatError, group_checkpoints
 from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
@@ -145,9 +145,15 @@ def make_env(task: str, simulator: str | None) -> envs.ActionConstrainedEnv:
 
 
 def check_robot(task: str) -> None:
-    """Raise ConfigError if the robot of `task` does not keep the protocol of `envs.Robot` in a few steps."""
+    """Raise ConfigError if the robot of `task` does not keep the protocol of `envs.Robot` in a few steps.
+
+    So it does if no algorithm has hyperparameters for the group that the robot names.
+    """
+    robot = envs.TASKS[task].robot
+    groups = {group: None for algorithm in ALGORITHMS.values() for group in algorithm.agent.paper}
+    known_name(f"hyperparameters of {robot.__name__}", robot.hyperparameters, groups)
     try:
-        envs.check_robot(TASKS[task].robot, steps=10)
+        envs.check_robot(robot, steps=10)
     except envs.RobotError as error:
         raise ConfigError(f"the robot of {task} does not work: {error}") from error
 

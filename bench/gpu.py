@@ -18,18 +18,22 @@ The parts come in this order, and each result is saved as soon as it is there, s
 Every part has a table in `out` as CSV and Markdown, gpu.md has all of them, and machine.json names the machine. What
 fails is in errors.txt, and the rest goes on.
 
-A machine without a network needs these wheels beside PyTorch, of its Python version (`pip wheel -w wheels ...`; the
-first line is enough for all parts but the tests):
+A machine that has PyTorch and no network needs some wheels of its Python version, 34 MB for all parts but the tests:
 
-    gymnasium farama-notifications cloudpickle mujoco omegaconf antlr4-python3-runtime==4.9.3 pyyaml tqdm numpy pillow
-    pytest pluggy iniconfig packaging pygments hypothesis sortedcontainers matplotlib scipy and what these two need
+    pip download -d wheels --no-deps --only-binary=:all: -c requirements-lock.txt gymnasium farama-notifications \\
+        cloudpickle mujoco mujoco-core omegaconf pyyaml tqdm numpy pillow typing_extensions
 
-Install them with `pip install --no-index --no-deps --target FOLDER wheels/*` and set PYTHONPATH=FOLDER and
-MUJOCO_GL=disable: MuJoCo then needs neither OpenGL nor the packages around it.
+The tests need pytest, pytest-xdist, hypothesis, matplotlib, scipy and what these depend on besides. On that machine:
+
+    pip install --no-index --no-deps --target FOLDER wheels/*
+    PYTHONPATH=FOLDER MUJOCO_GL=disable python bench/gpu.py
+
+With MUJOCO_GL=disable MuJoCo needs neither OpenGL nor the packages around it.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -72,7 +76,7 @@ DEFAULTS = {
     "device": "cuda",
     "out": "bench/results/gpu",
 }
-TESTS = ["tests/test_graph.py", "tests/test_device.py", "-k", "cuda or run_on_a_gpu"]
+TESTS = ["tests/test_graph.py", "tests/test_device.py", "tests/test_ahead.py", "-k", "cuda or run_on_a_gpu or ahead"]
 TEST_SECONDS = 120
 RUN_SEEDS = (1, 10)
 CELL_TASK, CELL_SEEDS = "R+L2", range(10)
@@ -104,6 +108,8 @@ class Options:
 def run_tests(options: Options) -> Table:
     """Run the tests that need CUDA; their output is in tests.txt."""
     command = [sys.executable, "-m", "pytest", "-q", "-o", "addopts=", "-p", "no:cacheprovider", "-rs", *TESTS]
+    if importlib.util.find_spec("xdist"):
+        command += ["-n", "4"]
     path = options.out / "tests.txt"
     start = time.monotonic()
     with open(path, "w", encoding="utf-8") as file:

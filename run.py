@@ -49,7 +49,7 @@ def carry_out(arguments: Sequence[str], stop_if_asked: Callable[[], None]) -> Ex
     sweep, settings = parse_sweep(arguments)
     cells = make_cells(settings)
     if sweep.wanted:
-        return launch(sweep, cells, "threads" in settings, stop_if_asked)
+        return launch(sweep, cells, stop_if_asked)
     return train_cells(cells, stop_if_asked)
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from constraints import Constraint
-from core.config import Config, PenaltyConfig
+from core.config import AUTO, Config, PenaltyConfig
 from core.maps import Map, Placement
 from core.random import Streams
 from core.replay import Batch
@@ -101,7 +101,8 @@ class Agent(Snapshots):
         self.placement = placement
         self.stores_centers = self.map.replays_center(constraint)
         self.penalty_weight = config.penalty if isinstance(config, PenaltyConfig) else None
-        self.device = torch.device(config.device)  # of networks, batches and what `explore` and `policy` are given
+        # Of networks, batches and what `explore` and `policy` are given. Who trains a cell has chosen (`sweep.train`).
+        self.device = torch.device("cpu" if config.device == AUTO else config.device)
         self.exploration = Streams(seeds, "explore", self.device)
         self.update_noise = Streams(seeds, "update", self.device)
         self.updates = 0  # gradient steps so far, where an algorithm counts them (see `cycle`)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import torch
 
 import envs
 from algos import ALGORITHMS, setting_keys
-from core.config import RUN_KEYS, Config, saved_settings
+from core.config import AUTO, RUN_KEYS, THREADS, Config, saved_settings
 from core.trainer import Trainer
 from core.words import ConfigError, known_name, parse_words
 from envs import TASKS
@@ -53,9 +54,9 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
 
     Prints each result and its folder. Returns whether every seed has a result.
     """
-    config, folders = cell.config, dict(zip(cell.seeds, cell.folders, strict=True))
+    config, folders = on_this_machine(cell.config), dict(zip(cell.seeds, cell.folders, strict=True))
     definition = define(config.env, config.algo)  # before its objects are used, which may change them
-    torch.set_num_threads(config.threads)
+    torch.set_num_threads(int(config.threads))
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
         torch.cuda.set_device(config.device)
@@ -125,6 +126,20 @@ def make_trainer(
         raise ConfigError(
             f"not enough memory for {len(seeds)} seeds with hidden={config.hidden}, buffer_size={config.buffer_size}"
         ) from error
+
+
+def on_this_machine(config: Config, threads: int | None = None) -> Config:
+    """`config` with the device and the threads for which "auto" stands here; `threads` for a cell that is not alone.
+
+    Both change the rounding of what is learned, and the chaos of training makes another run of it.
+    """
+    device = config.device
+    if device == AUTO:
+        gpu_pays = torch.cuda.is_available() and not TASKS[config.env].constraint.solved_on_cpu
+        device = "cuda" if gpu_pays else "cpu"
+    if config.threads == AUTO:
+        config = replace(config, threads=threads or THREADS[torch.device(device).type])
+    return replace(config, device=device)
 
 
 def check_device(name: str) -> None:
@@ -208,8 +223,9 @@ def _resume(
             print(f"{folders[seed]}: resuming from step {group[seed].step}")
     if len(seeds) < len(before):
         print(f"(trained with other seeds before, {len(before)} in all: equal up to rounding to an unbroken run)")
-    if (threads := group[seeds[0]].settings["threads"]) != config.threads:
-        print(f"(threads={config.threads} now, {threads} before: equal up to rounding to an unbroken run)")
+    for key, now in (("threads", config.threads), ("device", config.device)):
+        if (earlier := group[seeds[0]].settings[key]) != now:
+            print(f"({key}={now} now, {earlier} before: equal up to rounding to an unbroken run)")
     trainer = make_trainer(config, seeds, writers, True, stop_if_asked)
     trainer.restore([group[seed] for seed in seeds])
     _run(trainer)

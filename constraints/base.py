@@ -146,8 +146,7 @@ class Constraint(ABC):
         obs64, action64 = self._broadcast(obs, action)
         at = self._at(obs64)
         if is_traced(*tensors_of(at)):
-            solver = Solver(self._project, self._boundaries, self._free)
-            return differentiable_projection(solver, at, action64).to(action.dtype)
+            return self._differentiable_projection(at, action64).to(action.dtype)
         projected, jacobian = self._project(at, action64.detach())
         if projected.requires_grad:
             self._boundaries(at, projected)
@@ -234,7 +233,7 @@ class Constraint(ABC):
     def linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction).
 
-        It is a constant: gradients do not pass. RuntimeError where the observation or learned coefficients ask for them.
+        It is a constant, without gradients. RuntimeError where the observation or learned coefficients ask for them.
         """
         obs64, gradient64 = self._broadcast(obs, gradient.detach())
         at = self._at(obs64)
@@ -245,6 +244,10 @@ class Constraint(ABC):
         return keep_nan(self._linear_oracle(at, gradient64), gradient64).to(gradient.dtype)
 
     # ---------------------------------------------------------------- shared pieces
+
+    def _differentiable_projection(self, at: Any, action: Tensor) -> Tensor:
+        """The projection (..., d) with gradients by the action and by the tensors of `at`."""
+        return differentiable_projection(Solver(self._project, self._boundaries, self._free), at, action)
 
     def _gauge_and_gradient(self, at: Any, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         """Gauge (...) of the whole set, box included, and its gradient (..., d), both 0 where `direction` is.

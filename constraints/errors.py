@@ -50,7 +50,7 @@ class ConstraintError(ValueError):
 
 
 class EmptySetError(ConstraintError):
-    """No action meets the constraint of one sample."""
+    """No action meets the constraint of one sample, or none has room around it where a method needs that."""
 
 
 def name_samples(lead: tuple[int, ...]) -> SampleName:

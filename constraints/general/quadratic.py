@@ -10,7 +10,7 @@ from torch import Tensor
 from constraints.base import Ellipse, ExplicitSet
 from constraints.ellipse import ellipse_excess, ellipse_gauge_gradient
 from constraints.errors import name_samples, require
-from constraints.general.base import ON_BOUNDARY, GeneralConstraint, check_obs, checked
+from constraints.general.base import ON_BOUNDARY, At, GeneralConstraint, OnEmpty, check_obs, checked
 from constraints.numerics import times
 
 # Asymmetry and negative eigenvalues of Q up to this share of its largest entry are rounding, in float32 too.
@@ -36,8 +36,9 @@ class QuadraticConstraint(GeneralConstraint):
         Q: Coefficient | None = None,
         bound: Coefficient | float | None = None,
         c: Coefficient | None = None,
+        on_empty: OnEmpty = "error",
     ):
-        super().__init__(dim)
+        super().__init__(dim, on_empty)
         self._Q, self._bound, self._c = Q, bound, c
 
     def Q(self, obs: Tensor) -> Tensor:
@@ -57,7 +58,12 @@ class QuadraticConstraint(GeneralConstraint):
         return obs.new_zeros(self.dim) if self._c is None else self._c(obs)
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
-        return ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [Ellipse(*self._ellipse(obs))])
+        return self._coefficients(obs).written
+
+    def _coefficients(self, obs: Tensor) -> At:
+        ellipse = Ellipse(*self._ellipse(obs))
+        written = ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [ellipse])
+        return At(obs, [ellipse.matrix, ellipse.center, torch.as_tensor(ellipse.bound)], lambda: written)
 
     def _ellipse(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Q, c and the bound, checked."""
@@ -78,14 +84,14 @@ class QuadraticConstraint(GeneralConstraint):
         require((bound > 0.0).flatten(), "bound(obs) is not positive", name_samples(tuple(bound.shape)))
         return matrix, center, bound
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        matrix, center, bound = self._ellipse(obs)
+    def _violation(self, at: At | Tensor, action: Tensor) -> Tensor:
+        matrix, center, bound = self.at(at)
         offset = action - center
         value = (offset * times(matrix, offset)).sum(-1)
         return ellipse_excess(value, matrix.diagonal(dim1=-2, dim2=-1).sum(-1), bound, self.dim)
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        matrix, middle, bound = self._ellipse(obs)
+    def _part_gauges(self, at: At, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        matrix, middle, bound = at
         offset = (-middle if center is None else center - middle).expand_as(direction)
         bent = times(matrix, offset)
         inside = (bent * offset).sum(-1) < bound * (1.0 - ON_BOUNDARY)

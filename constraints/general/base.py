@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from constraints.base import Constraint
-from constraints.errors import ConstraintError, name_samples, require
+from constraints.checks import ON_BOUNDARY, checked
+from constraints.errors import name_samples, require
 from constraints.general.centers import chebyshev_centers, interior_points
 from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.projection import closest_points, optimal_points, projection_jacobian
@@ -14,8 +15,7 @@ from constraints.general.scaled_sets import ScaledSets, scale_sets
 from constraints.jacobian import JacobianProduct
 from constraints.numerics import is_traced, times
 
-# A centre given for a gauge that is nearer than this to the boundary is on it, up to rounding.
-ON_BOUNDARY = 1e-12
+__all__ = ["ON_BOUNDARY", "GeneralConstraint", "check_obs", "checked"]
 
 
 class GeneralConstraint(Constraint):
@@ -23,6 +23,9 @@ class GeneralConstraint(Constraint):
 
     origin_centered = False
     solved_on_cpu = True
+
+    def _check_center(self, obs: Tensor, center: Tensor) -> None:
+        pass  # in every call where it is used, below and in the subclasses
 
     def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         if center is not None:
@@ -75,27 +78,3 @@ def check_obs(obs: Tensor) -> None:
     """Raise a ConstraintError for a NaN or infinite observation."""
     valid = obs.isfinite().all(-1)
     require(valid.flatten(), "the observation is NaN or infinite", name_samples(tuple(valid.shape)))
-
-
-def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tensor) -> Tensor:
-    """Coefficients as float64 (*lead, *shape), finite and of the expected shape, or a ConstraintError.
-
-    -1 in `shape` stands for any size; lead may be the observation's leading shape or one that broadcasts to it.
-    """
-    values = torch.as_tensor(values, dtype=torch.float64, device=obs.device)
-    lead = values.shape[: values.dim() - len(shape)]
-    fits = len(values.shape) >= len(shape) and all(
-        have == want or want == -1 for have, want in zip(values.shape[len(lead) :], shape, strict=True)
-    )
-    try:
-        fits = fits and torch.broadcast_shapes(lead, obs.shape[:-1]) == obs.shape[:-1]
-    except RuntimeError:
-        fits = False
-    if not fits:
-        wanted = ", ".join(["..."] + ["m" if size == -1 else str(size) for size in shape])
-        raise ConstraintError(
-            f"{what} has shape {tuple(values.shape)}, expected ({wanted}) with ... = {tuple(obs.shape[:-1])}"
-        )
-    valid = values.isfinite().flatten(len(lead)).all(-1) if shape else values.isfinite()
-    require(valid.flatten(), f"{what} is NaN or infinite", name_samples(tuple(lead)))
-    return values

@@ -8,13 +8,11 @@ import torch
 from torch import Tensor
 
 from constraints.base import Ellipse, ExplicitSet
+from constraints.checks import check_semidefinite
 from constraints.ellipse import ellipse_excess, ellipse_gauge_gradient
 from constraints.errors import name_samples, require
 from constraints.general.base import ON_BOUNDARY, GeneralConstraint, check_obs, checked
 from constraints.numerics import times
-
-# Asymmetry and negative eigenvalues of Q up to this share of its largest entry are rounding, in float32 too.
-_ROUNDING = 1e-6
 
 Coefficient = Callable[[Tensor], Tensor]
 
@@ -65,14 +63,9 @@ class QuadraticConstraint(GeneralConstraint):
         matrix = checked(self.Q(obs), "Q(obs)", (self.dim, self.dim), obs)
         center = checked(self.c(obs), "c(obs)", (self.dim,), obs)
         bound = checked(self.bound(obs), "bound(obs)", (), obs)
-        name = name_samples(tuple(matrix.shape[:-2]))
-        largest = matrix.abs().flatten(-2).amax(-1)
-        skew = (matrix - matrix.mT).abs().flatten(-2).amax(-1)
-        require((skew <= _ROUNDING * largest).flatten(), "Q(obs) is not symmetric", name)
+        least = check_semidefinite(matrix.detach(), "Q(obs)")
         matrix = 0.5 * (matrix + matrix.mT)
-        least = torch.linalg.eigvalsh(matrix)[..., 0]
-        require((least >= -_ROUNDING * largest).flatten(), "Q(obs) is not positive semi-definite", name)
-        matrix = matrix + (-least.detach()).clamp(min=0.0)[..., None, None] * torch.eye(
+        matrix = matrix + (-least).clamp(min=0.0)[..., None, None] * torch.eye(
             self.dim, dtype=matrix.dtype, device=matrix.device
         )
         require((bound > 0.0).flatten(), "bound(obs) is not positive", name_samples(tuple(bound.shape)))

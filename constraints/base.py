@@ -18,6 +18,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from constraints.checks import ON_BOUNDARY, check_tensor
+from constraints.coefficients import FirstCalls
+from constraints.errors import name_samples, require
 from constraints.gauge import box_gauge_gradient, largest_gauge
 from constraints.implicit import Boundary, Solver, differentiable_projection, tensors_of
 from constraints.jacobian import JacobianProduct, with_jacobian
@@ -60,6 +63,7 @@ class Constraint(ABC):
         if dim < 1:
             raise ValueError(f"dim must be at least 1, got {dim}")
         self.dim = dim
+        self._center_calls = FirstCalls()
 
     # ---------------------------------------------------------------- what a subclass gives
 
@@ -132,6 +136,10 @@ class Constraint(ABC):
         box = action64.abs().amax(-1) - 1.0
         return torch.maximum(box, self._violation(self._at(obs64), action64)).to(action.dtype)
 
+    def contains(self, obs: Tensor, action: Tensor, tolerance: float = 1e-6) -> Tensor:
+        """Whether (...) the action is feasible up to `tolerance`, in the units of `violation`; False for a NaN."""
+        return self.violation(obs, action) <= tolerance
+
     def penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         """Penalty (...) of the '+' algorithms on an action in the box (paper, "Algorithms").
 
@@ -159,6 +167,7 @@ class Constraint(ABC):
 
         It is the Chebyshev centre of a linear set, the ellipse's centre otherwise, the origin where both are present.
         """
+        check_tensor("obs", obs)
         if not obs.is_floating_point():
             raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
         center = self._center(self._at(obs.double()))
@@ -172,8 +181,8 @@ class Constraint(ABC):
         `center + direction / L` is on the boundary; L is convex and positively homogeneous of degree 1.
         """
         obs64, direction64 = self._broadcast(obs, direction)
-        center64 = None if center is None else center.double()
         at = self._at(obs64)
+        center64 = None if center is None else self._given_center(at, center)
         # L is homogeneous. At length 1, the squares of even the tiniest direction stay above zero.
         size = one_where_zero(direction64.detach().abs().amax(-1))
         if is_traced(center64, *tensors_of(at)):
@@ -190,7 +199,7 @@ class Constraint(ABC):
         """
         obs64, action64 = self._broadcast(obs, action)
         at = self._at(obs64)
-        center64 = self._center(at) if center is None else center.double()
+        center64 = self._center(at) if center is None else self._given_center(at, center)
         offset = action64 if center64 is None else action64 - center64
         traced = is_traced(center64, *tensors_of(at))
         return Ray(
@@ -235,6 +244,7 @@ class Constraint(ABC):
 
         It is a constant, without gradients. RuntimeError where the observation or learned coefficients ask for them.
         """
+        check_tensor("gradient", gradient)
         obs64, gradient64 = self._broadcast(obs, gradient.detach())
         at = self._at(obs64)
         if torch.is_grad_enabled() and any(value.requires_grad for value in tensors_of(at)):
@@ -257,10 +267,29 @@ class Constraint(ABC):
         box = box_gauge_gradient(direction, center)
         return largest_gauge(direction, box, *self._gauge_gradients(at, direction, center))
 
+    def _given_center(self, at: Any, center: Tensor) -> Tensor:
+        """A centre (..., d) that was given, in float64. ValueError for another shape, and see `_check_center`."""
+        check_tensor("center", center)
+        if center.shape[-1:] != (self.dim,):
+            raise ValueError(f"expected {self.dim} coordinates of the center, got shape {tuple(center.shape)}")
+        center = center.double()
+        if self._center_calls.wanted():
+            self._check_center(at, center)
+        return center
+
+    @torch.no_grad()
+    def _check_center(self, at: Any, center: Tensor) -> None:
+        """Raise a ConstraintError for a centre that is not inside the set; a NaN is passed on."""
+        if self._center_calls.readable(center):
+            excess = torch.maximum(center.abs().amax(-1) - 1.0, self._violation(at, center))
+            require(~(excess >= -ON_BOUNDARY).flatten(), "the center is not inside the set", name_samples(excess.shape))
+
     def _broadcast(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Both in float64, the action with the common leading shape. ValueError or TypeError for a wrong action."""
-        if action.shape[-1] != self.dim:
-            raise ValueError(f"expected {self.dim} action coordinates, got {action.shape[-1]}")
+        check_tensor("obs", obs)
+        check_tensor("action", action)
+        if action.shape[-1:] != (self.dim,):
+            raise ValueError(f"expected {self.dim} action coordinates, got shape {tuple(action.shape)}")
         if not action.is_floating_point():
             raise TypeError(f"expected float32 or float64 actions, got {action.dtype}")
         obs, action = obs.double(), action.double()

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from constraints.base import Constraint, ExplicitSet
+from constraints.checks import ON_BOUNDARY
 from constraints.ellipse import ellipse_gauge_gradient
 from constraints.errors import ConstraintError, EmptySetError, name_samples, require
 from constraints.general.active_set import project_on_rows
@@ -20,9 +21,6 @@ from constraints.general.projection import closest_points, optimal_points
 from constraints.general.scaled_sets import ScaledSets, scale_sets
 from constraints.jacobian import JacobianProduct
 from constraints.numerics import is_traced, times
-
-# A centre given for a gauge that is nearer than this to the boundary is on it, up to rounding.
-ON_BOUNDARY = 1e-12
 
 OnEmpty = Literal["error", "least"]
 Result = TypeVar("Result")
@@ -83,6 +81,9 @@ class GeneralConstraint(Constraint):
     def at(self, at: At | Tensor) -> At:
         """The coefficients, whatever `_at` returned."""
         return self._coefficients(at) if isinstance(at, Tensor) else at
+
+    def _check_center(self, at: At | Tensor, center: Tensor) -> None:
+        pass  # in every call where it is used, below and in the subclasses
 
     def _gauge_and_gradient(self, at: At | Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         if center is not None:
@@ -204,27 +205,3 @@ def check_obs(obs: Tensor) -> None:
     """Raise a ConstraintError for a NaN or infinite observation."""
     valid = obs.isfinite().all(-1)
     require(valid.flatten(), "the observation is NaN or infinite", name_samples(tuple(valid.shape)))
-
-
-def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tensor) -> Tensor:
-    """Coefficients as float64 (*lead, *shape), finite and of the expected shape, or a ConstraintError.
-
-    -1 in `shape` stands for any size; lead may be the observation's leading shape or one that broadcasts to it.
-    """
-    values = torch.as_tensor(values, dtype=torch.float64, device=obs.device)
-    lead = values.shape[: values.dim() - len(shape)]
-    fits = len(values.shape) >= len(shape) and all(
-        have == want or want == -1 for have, want in zip(values.shape[len(lead) :], shape, strict=True)
-    )
-    try:
-        fits = fits and torch.broadcast_shapes(lead, obs.shape[:-1]) == obs.shape[:-1]
-    except RuntimeError:
-        fits = False
-    if not fits:
-        wanted = ", ".join(["..."] + ["m" if size == -1 else str(size) for size in shape])
-        raise ConstraintError(
-            f"{what} has shape {tuple(values.shape)}, expected ({wanted}) with ... = {tuple(obs.shape[:-1])}"
-        )
-    valid = values.isfinite().flatten(len(lead)).all(-1) if shape else values.isfinite()
-    require(valid.flatten(), f"{what} is NaN or infinite", name_samples(tuple(lead)))
-    return values

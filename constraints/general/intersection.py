@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from constraints.base import Constraint, ExplicitSet
+from constraints.checks import ON_BOUNDARY
 from constraints.errors import name_samples, require
-from constraints.general.base import ON_BOUNDARY, At, GeneralConstraint, OnEmpty, check_obs
+from constraints.general.base import At, GeneralConstraint, OnEmpty, check_obs
 from constraints.implicit import tensors_of
 
 

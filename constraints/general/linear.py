@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from constraints.base import ExplicitSet
+from constraints.checks import ON_BOUNDARY, checked
 from constraints.errors import name_samples, require
-from constraints.general.base import ON_BOUNDARY, At, GeneralConstraint, OnEmpty, check_obs, checked
+from constraints.general.base import At, GeneralConstraint, OnEmpty, check_obs
 from constraints.general.scaled_sets import unit_rows
 from constraints.numerics import safe_sqrt, times
 

@@ -8,13 +8,11 @@ import torch
 from torch import Tensor
 
 from constraints.base import Ellipse, ExplicitSet
+from constraints.checks import ON_BOUNDARY, check_semidefinite, checked
 from constraints.ellipse import ellipse_excess, ellipse_gauge_gradient
 from constraints.errors import name_samples, require
-from constraints.general.base import ON_BOUNDARY, At, GeneralConstraint, OnEmpty, check_obs, checked
+from constraints.general.base import At, GeneralConstraint, OnEmpty, check_obs
 from constraints.numerics import times
-
-# Asymmetry and negative eigenvalues of Q up to this share of its largest entry are rounding, in float32 too.
-_ROUNDING = 1e-6
 
 Coefficient = Callable[[Tensor], Tensor]
 
@@ -61,9 +59,9 @@ class QuadraticConstraint(GeneralConstraint):
         return self._coefficients(obs).written
 
     def _coefficients(self, obs: Tensor) -> At:
-        ellipse = Ellipse(*self._ellipse(obs))
-        written = ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [ellipse])
-        return At(obs, [ellipse.matrix, ellipse.center, torch.as_tensor(ellipse.bound)], lambda: written)
+        ellipse = self._ellipse(obs)
+        written = ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [Ellipse(*ellipse)])
+        return At(obs, list(ellipse), lambda: written)
 
     def _ellipse(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Q, c and the bound, checked."""
@@ -71,14 +69,9 @@ class QuadraticConstraint(GeneralConstraint):
         matrix = checked(self.Q(obs), "Q(obs)", (self.dim, self.dim), obs)
         center = checked(self.c(obs), "c(obs)", (self.dim,), obs)
         bound = checked(self.bound(obs), "bound(obs)", (), obs)
-        name = name_samples(tuple(matrix.shape[:-2]))
-        largest = matrix.abs().flatten(-2).amax(-1)
-        skew = (matrix - matrix.mT).abs().flatten(-2).amax(-1)
-        require((skew <= _ROUNDING * largest).flatten(), "Q(obs) is not symmetric", name)
+        least = check_semidefinite(matrix.detach(), "Q(obs)")
         matrix = 0.5 * (matrix + matrix.mT)
-        least = torch.linalg.eigvalsh(matrix)[..., 0]
-        require((least >= -_ROUNDING * largest).flatten(), "Q(obs) is not positive semi-definite", name)
-        matrix = matrix + (-least.detach()).clamp(min=0.0)[..., None, None] * torch.eye(
+        matrix = matrix + (-least).clamp(min=0.0)[..., None, None] * torch.eye(
             self.dim, dtype=matrix.dtype, device=matrix.device
         )
         require((bound > 0.0).flatten(), "bound(obs) is not positive", name_samples(tuple(bound.shape)))

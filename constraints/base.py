@@ -56,6 +56,8 @@ class Constraint(ABC):
 
     origin_centered: bool = True
     """True where `center(obs)` is the origin for every obs, so that no centre needs to be stored."""
+    on_empty: str = "error"
+    """What happens where no action meets the constraint, "error" or "least"; see `GeneralConstraint`."""
     solved_on_cpu: bool = False
     """True where a solver runs on the CPU, so that a GPU has to wait. No CUDA graph can hold such a set."""
 
@@ -162,10 +164,15 @@ class Constraint(ABC):
             return with_jacobian(action.expand(action64.shape), projected, jacobian)
         return projected.to(action.dtype)
 
+    def least_violation(self, obs: Tensor) -> Tensor:
+        """The least violation (...) that an action in the box can have, at obs (..., n); 0 if the set has one."""
+        return obs.new_zeros(obs.shape[:-1])  # closed forms contain the origin
+
     def center(self, obs: Tensor) -> Tensor:
         """Interior point (..., d) of the set, in the dtype of `obs` (paper, "alpha-Projection Layer").
 
         It is the Chebyshev centre of a linear set, the ellipse's centre otherwise, the origin where both are present.
+        The classes of sets of one's own say what theirs is.
         """
         check_tensor("obs", obs)
         if not obs.is_floating_point():

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pickle
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+import envs
 from constraints import (
     Box,
     ConstraintError,
@@ -17,6 +19,7 @@ from constraints import (
     WeightedL1,
 )
 from constraints.errors import EmptySetError
+from envs import TASKS, InfeasibleActionError, Robot, Task
 
 
 def slab(obs: Tensor) -> Tensor:
@@ -114,16 +117,17 @@ def test_the_least_violation(name):
     constraint, obs = EMPTY[name]
     obs, action = obs.double(), torch.tensor([0.9, -0.7], dtype=torch.float64).expand(4, 2)
     least = least_violation(constraint, obs)
+    exact = constraint.least_violation(obs)
+    assert (exact <= least.clamp(min=0.0) + 1e-9).all() and (exact >= least - 1.1e-2)[least > 0.0].all()
+    assert (exact[least <= 0.0] == 0.0).all()
     assert (least > 1e-3).any() and (least < 0.0).any() or name == "row outside the box"
     for method, call in methods(constraint, obs, action).items():
         result = call()
         violation = constraint.violation(obs, result)
         assert result.abs().max() <= 1.0 + 1e-12, method
-        # The grid is 1e-2 wide, so that its least is at most that larger.
-        assert (violation <= least.clamp(min=0.0) + 1e-6).all(), method
-        assert (violation >= least - 1.1e-2)[least > 0.0].all(), method
+        assert (violation <= exact + 1e-6).all() and (violation >= exact - 1e-9)[exact > 0.0].all(), method
         single = constraint.violation(obs, methods(constraint, obs.float(), action.float())[method]().double())
-        assert (single <= least.clamp(min=0.0) + 2e-6).all(), method
+        assert (single <= exact + 2e-6).all(), method
     # Of the points with the least violation, the projection is the nearest, the oracle's the furthest along.
     others = constraint.project(obs.unsqueeze(1), 2.0 * torch.rand(1, 200, 2, dtype=torch.float64) - 1.0)
     nearest = (constraint.project(obs, action) - action).norm(dim=-1, keepdim=True)
@@ -153,7 +157,7 @@ def test_a_row_that_no_action_meets_does_not_count():
     obs = torch.zeros(1, 1, dtype=torch.float64)
     projected = constraint.project(obs, torch.tensor([[0.9, 0.3]], dtype=torch.float64))
     torch.testing.assert_close(projected, torch.tensor([[-0.5, 0.3]], dtype=torch.float64), rtol=0.0, atol=1e-6)
-    assert constraint.violation(obs, projected) == 1.0
+    assert constraint.violation(obs, projected) == 1.0 and constraint.least_violation(obs) == 1.0
 
 
 def test_gradients_of_the_least_violation():
@@ -170,3 +174,45 @@ def test_choices_of_on_empty():
     assert linear().on_empty == "error" and curved("least").on_empty == "least"
     with pytest.raises(ValueError, match="on_empty is 'nearest' \\(choices: 'error' 'least'\\)"):
         linear("nearest")
+
+
+class Still(Robot):
+    """Observation (2,): a number of the episode's steps, and 0."""
+
+    obs_dim, action_dim, max_episode_steps, fps = 2, 2, 10, 10
+
+    def reset(self, rng):
+        self.steps = 0.0
+        return np.array([0.5, 0.0])
+
+    def step(self, action):
+        self.steps += 1.0
+        return np.array([0.5 - 0.2 * self.steps, 0.0]), 0.0, False, {}
+
+    def render(self):
+        return np.zeros((480, 480, 3), np.uint8)
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("project", [False, True])
+def test_an_environment_admits_the_least_violation(project, monkeypatch):
+    for on_empty in ("error", "least"):
+        monkeypatch.setitem(TASKS, "X+E", Task(Still, linear(on_empty), "empty after a step", "", 1000))
+        env = envs.make("X+E", project=project)
+        env.reset(seed=0)
+        inside = env.constraint.project(torch.tensor([0.5, 0.0]).double(), torch.zeros(2).double()).numpy()
+        env.step(inside)
+        env.step(inside)  # the set of the second step is flat, of the third one empty: 0.3 <= . <= 0.1
+        if on_empty == "error":
+            with pytest.raises(ConstraintError if project else InfeasibleActionError):
+                env.step(inside)
+            continue
+        obs = torch.tensor([0.1, 0.0], dtype=torch.float64)
+        assert env.constraint.least_violation(obs).item() == pytest.approx(0.1)
+        if not project:
+            with pytest.raises(InfeasibleActionError, match="at most 0.1"):
+                env.step(inside)
+        env.step(env.constraint.project(obs, torch.from_numpy(inside)).numpy())
+        assert env.largest_violation == pytest.approx(0.1, abs=1e-6)

@@ -14,7 +14,7 @@ from constraints.checks import ON_BOUNDARY
 from constraints.ellipse import ellipse_gauge_gradient
 from constraints.errors import ConstraintError, EmptySetError, name_samples, require
 from constraints.general.active_set import project_on_rows
-from constraints.general.centers import deep_points, guessed_points, interior_points, widened
+from constraints.general.centers import deep_points, guessed_points, interior_points, least_excess, widened
 from constraints.general.derivatives import projection_jacobian, with_derivatives
 from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.projection import closest_points, optimal_points
@@ -65,6 +65,14 @@ class GeneralConstraint(Constraint):
         if on_empty not in ("error", "least"):
             raise ValueError(f"on_empty is {on_empty!r} (choices: 'error' 'least')")
         self.on_empty = on_empty
+
+    @torch.no_grad()
+    def least_violation(self, obs: Tensor) -> Tensor:
+        at = self._coefficients(obs.double())
+        sets = scale_sets(at.written, at.lead, check=False)
+        # A row 0 <= b is violated by -b wherever one is.
+        fixed = torch.where(sets.solid, 0.0, -sets.bounds).amax(-1)
+        return torch.maximum(least_excess(sets), fixed).clamp(min=0.0).view(at.lead).to(obs)
 
     def _coefficients(self, obs: Tensor) -> At:
         """The coefficients at obs (..., n), checked."""

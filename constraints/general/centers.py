@@ -141,21 +141,29 @@ def _deepest_in_cones(sets: ScaledSets, box: bool) -> tuple[Tensor, Tensor]:
     return torch.cat((origin + solution[:, :-1], solution[:, -1:]), -1), converged
 
 
+def least_excess(sets: ScaledSets) -> Tensor:
+    """The least (n,) by which points of the box leave rows and ellipses, negative where they are inside.
+
+    A row 0 <= b does not count. Where there is nothing else, it is -1.
+    """
+    sets = replace(sets, bounds=torch.where(sets.solid, sets.bounds, 1.0))
+    bounded = (sets.solid & sets.given).any(-1) | (sets.matrix.shape[1] > 0)
+    excess = torch.full_like(sets.bounds[:, 0], -1.0)
+    index = bounded.nonzero().squeeze(-1)
+    if len(index) > 0:
+        part = sets[index]
+        deepest = (_deepest_in_cones(part, False) if sets.curved else deepest_on_rows(part, False))[0]
+        excess[index] = -deepest[:, -1]
+    return excess
+
+
 def widened(sets: ScaledSets) -> ScaledSets:
     """The sets with rows and ellipses, not the box, moved outwards by the same distance where they are empty or flat.
 
     The distance is the least with which a set has an interior of the depth `_ROOM`: its points violate the constraint
     by no more than the least possible violation and `_ROOM`. A row 0 <= b < 0 is left out, as no action meets it.
     """
-    sets = replace(sets, bounds=torch.where(sets.solid, sets.bounds, 1.0))
-    # Where nothing bounds the depth it counts as 1.
-    bounded = (sets.solid & sets.given).any(-1) | (sets.matrix.shape[1] > 0)
-    depth = torch.ones_like(sets.bounds[:, 0])
-    index = bounded.nonzero().squeeze(-1)
-    if len(index) > 0:
-        part = sets[index]
-        depth[index] = (_deepest_in_cones(part, False) if sets.curved else deepest_on_rows(part, False))[0][:, -1]
-    excess = (_ROOM - depth).clamp(min=0.0).unsqueeze(-1)
-    bounds = sets.bounds + excess * sets.given
-    growth = (1.0 + excess / sets.root).square()
-    return replace(sets, bounds=bounds, matrix=sets.matrix / growth[..., None, None], root=sets.root + excess)
+    growth = (least_excess(sets) + _ROOM).clamp(min=0.0).unsqueeze(-1)
+    bounds = torch.where(sets.solid, sets.bounds, 1.0) + growth * sets.given
+    factor = (1.0 + growth / sets.root).square()
+    return replace(sets, bounds=bounds, matrix=sets.matrix / factor[..., None, None], root=sets.root + growth)

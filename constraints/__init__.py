@@ -3,6 +3,7 @@
 from constraints.ball import Ball
 from constraints.base import Constraint
 from constraints.box import Box
+from constraints.coefficients import check_inputs
 from constraints.ellipse import DiagonalEllipse, PlanarEllipse
 from constraints.errors import ConstraintError
 from constraints.general import Intersection, InUnits, LinearConstraint, QuadraticConstraint
@@ -24,4 +25,5 @@ __all__ = [
     "WeightedL1",
     "WeightedL1AndEllipse",
     "WeightedPositivePart",
+    "check_inputs",
 ]

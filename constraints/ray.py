@@ -45,7 +45,7 @@ class Ray:
         gauge_of: Callable[[Tensor], tuple[Tensor, Tensor]],
     ):
         self.action, self.center, self.offset = action, center, offset
-        self.gauge_of = gauge_of
+        self._gauge_of = gauge_of
 
     @property
     def gauge(self) -> Tensor:
@@ -61,7 +61,7 @@ class Ray:
     def _gauge_and_gradient(self) -> tuple[Tensor, Tensor]:
         # In the autograd mode in which the ray was made, whatever the mode of the first use.
         with torch.set_grad_enabled(self.offset.requires_grad):
-            gauge, gradient = self.gauge_of(self.offset)
+            gauge, gradient = self._gauge_of(self.offset)
         return gauge.detach(), gradient
 
     def alpha_map(self) -> Tensor:
@@ -182,7 +182,7 @@ class Ray:
             offset = self._action64()
             size = offset.abs().amax(-1)
             direction = offset / one_where_zero(size).unsqueeze(-1)
-            gauge, gradient = self.gauge_of(direction)
+            gauge, gradient = self._gauge_of(direction)
             # A NaN gauge stays NaN.
             factor = torch.where(size == 0.0, 1.0, gauge).reciprocal()
             face = box_gauge_gradient(direction, None)

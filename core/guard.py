@@ -66,14 +66,14 @@ class Guard:
         def guarded(*args: Any, **kwargs: Any) -> Any:
             result, rows = self._call(method, args, kwargs)
             if isinstance(result, Ray):
-                result.gauge_of = self._guarded_gauge(result, rows, method, args, kwargs)
+                result._gauge_of = self._guarded_gauge(result, rows, method, args, kwargs)
             return result
 
         return guarded
 
     def _guarded_gauge(self, ray: Ray, rows: Sequence[int], method: Callable, args: tuple, kwargs: dict) -> Callable:
         """A ray asks for its gauge later. This guards that as well."""
-        gauge_of = ray.gauge_of
+        gauge_of = ray._gauge_of
 
         def guarded(direction: Tensor) -> tuple[Tensor, Tensor]:
             ask, stand_in = gauge_of, rows
@@ -83,7 +83,7 @@ class Guard:
                 except ConstraintError as error:
                     self._refuse(error, _arguments(method, args, kwargs).arguments["obs"], stand_in)
                     again, stand_in = self._call(method, args, kwargs)
-                    ask = again.gauge_of
+                    ask = again._gauge_of
 
         return guarded
 
@@ -109,10 +109,10 @@ class Guard:
         Raises the error where it names no seed, and where no seed is left.
         """
         lead = obs.shape[:-1]
-        if error.index is None or len(error.index) < len(lead) or not self._has_seeds(obs):
+        if error.sample is None or len(error.sample) < len(lead) or not self._has_seeds(obs):
             raise error
         # The batch may have more leading dimensions than the observations, which repeat along those.
-        first, *others = error.index[len(error.index) - len(lead) :]
+        first, *others = error.sample[len(error.sample) - len(lead) :]
         index = (rows[first], *others)
         self.refused[self.positions[rows[first]]] = refusal(error, obs[index])
         if all(position in self.refused for position in self.positions):

@@ -56,7 +56,7 @@ class ScaledSets:
             self.matrix[index],
             self.center[index],
             self.root[index],
-            self.name.of(positions),
+            self.name.part(positions),
         )
 
     def ellipse_values(self, point: Tensor) -> tuple[Tensor, Tensor]:

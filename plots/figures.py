@@ -117,7 +117,9 @@ def _draw_training(
             line = line_of(curve.algo, own, points) | {"linestyle": curve.style}
             _draw_curve(first, learning_curve(curve.runs), line | {"label": curve.label})
             for axes, measure in zip(others, measures, strict=False):
-                points_of = [(run.training["step"], run.training[measure]) for run in curve.runs if run.training]
+                points_of = [
+                    (run.training["step"], run.training[measure]) for run in curve.runs if measure in run.training
+                ]
                 _draw_curve(axes, mean_curve(points_of), line)
         _label_axes(first, "Evaluation return")
         for axes, measure in zip(others, measures, strict=False):

@@ -75,7 +75,7 @@ def reward_table(groups: Groups, beside: bool = False) -> Table:
                     cells.append(TableCell(("Same as", same), missing=True, merge=True) if same in row else missing)
                 if algo in printed:
                     stat = theirs[algo]
-                    cells.append(TableCell(_lines(stat, digits)) if stat else missing)
+                    cells.append(TableCell(describe(stat, digits)) if stat else missing)
             rows.append(cells)
         sections.append(rows)
     title = "Rewards: mean ± standard error over seeds (n where not ten), best three of a row bold"
@@ -98,7 +98,8 @@ def _columns(statistics: Mapping[Condition, Mapping[str, Statistic]], printed: I
     return order_algos(algos)
 
 
-def _lines(stat: Statistic, digits: int) -> tuple[str, ...]:
+def describe(stat: Statistic, digits: int) -> tuple[str, ...]:
+    """Mean, standard error, and the number of seeds unless it is the paper's."""
     error = f"± {stat.se:.{digits}f}" if stat.n > 1 else ""
     count = f"n={stat.n}" if stat.n != PAPER_SEEDS else ""
     return tuple(filter(None, (f"{stat.mean:.{digits}f}", error, count)))
@@ -106,7 +107,7 @@ def _lines(stat: Statistic, digits: int) -> tuple[str, ...]:
 
 def _our_lines(stat: Statistic, digits: int, runs: Sequence[Run]) -> tuple[str, ...]:
     """The lines of our cell: a dagger and a note where seeds diverged, a note where some have no result."""
-    value, *others = _lines(stat, digits)
+    value, *others = describe(stat, digits)
     failed, diverged = count_failed(runs), count_diverged(runs)
     if diverged:
         value, others = f"{value}{DAGGER}", [*others, f"{diverged} of {len(runs)} diverged"]
@@ -134,7 +135,7 @@ def comparison_table(groups: Groups) -> Table:
                 else:
                     difference = ours.mean - theirs.mean
                     joint = difference / math.hypot(ours.se, theirs.se)
-                    texts += [" ".join(_lines(theirs, digits)), f"{difference:+.{digits}f}"]
+                    texts += [" ".join(describe(theirs, digits)), f"{difference:+.{digits}f}"]
                     texts.append(f"{joint:+.1f}" if ours.n > 1 else MISSING)
                     record |= {"paper_mean": theirs.mean, "paper_se": theirs.se}
                     record |= {"difference": difference, "joint_errors": joint}

@@ -23,9 +23,10 @@ from sweep.states import Stage, state_of
 from sweep.status import find_cells
 
 ROOT = Path(__file__).parents[1]
-CELLS = "algo=DPre,SRad,NFW,DAlpha,SPre+ env=R+N seed=3,5"
+ALGOS = "DPre,SRad,NFW,DAlpha,SPre+"
+STEPS = 6000
 WORDS = (
-    f"{CELLS} steps=6000 learning_starts=100 batch_size=4 hidden=[8,8] eval_every=2000 eval_episodes=1"
+    f"env=R+N seed=3,5 steps={STEPS} learning_starts=100 batch_size=4 hidden=[8,8] eval_every=2000 eval_episodes=1"
     " final_episodes=1 checkpoint_every=50 train_freq=1 gradient_steps=1"
 )
 # Slurm looks at time limits twice a minute, and may send the signal half a minute early.
@@ -58,9 +59,9 @@ def slurm():
         subprocess.run(["scancel", job], timeout=60)
 
 
-def submit(root, jobs):
+def submit(root, jobs, algos=ALGOS):
     """Give the command once more, as from a shell; how many jobs it submitted."""
-    command = [sys.executable, "run.py", *WORDS.split(), *SLURM.split(), f"results={root}"]
+    command = [sys.executable, "run.py", f"algo={algos}", *WORDS.split(), *SLURM.split(), f"results={root}"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     if "nothing to submit" in done.stdout:
@@ -70,11 +71,27 @@ def submit(root, jobs):
     return int(line.split()[1])
 
 
-class Fault:
-    """Something that happens to a cell's job, once the cell has a checkpoint."""
+def status_of(pid):
+    """The fields of /proc/<pid>/status, by name; empty once the process is gone."""
+    try:
+        return dict(line.split(":\t", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    except (FileNotFoundError, ProcessLookupError):
+        return {}
 
-    def __init__(self, cell):
-        self.cell, self.stage, self.first = cell, 0, None
+
+class Fault:
+    """Something that happens to a cell's job between a tenth and half of its steps.
+
+    The process is stopped before it is struck, and goes on once the signals of `awaited` wait for it: however fast the
+    job is and however slow Slurm, it is struck at that point, with whole checkpoints before it. A run that was over
+    before it could be stopped is deleted and submitted again.
+    """
+
+    awaited = ()
+
+    def __init__(self, cell, root, jobs):
+        self.cell, self.root, self.jobs = cell, root, jobs
+        self.stage, self.first, self.struck, self.senders = 0, None, None, []
 
     @property
     def job(self):
@@ -84,33 +101,68 @@ class Fault:
         return self.job in queue([self.job])
 
     def owner(self):
-        """The process that trains the cell, as its lock describes it; None where there is none."""
+        """The number of the process that trains the cell, from its lock; None where there is none."""
         lock = self.cell.folders[0].with_name("seed=3.lock")
         try:
-            return json.loads(lock.read_text())
+            return json.loads(lock.read_text())["pid"]
         except (FileNotFoundError, ValueError):
             return None
 
+    def submit(self):
+        return submit(self.root, self.jobs, self.cell.variant.partition(",")[0])
+
     def send(self, *signals):
-        # Not waited for: scancel tries for a minute where a job is just being requeued.
+        # Not waited for: scancel repeats for a minute what it has sent to a job of an array.
         self.senders = [
             subprocess.Popen(["scancel", f"--signal={name}", self.job], stderr=subprocess.DEVNULL) for name in signals
         ]
 
     def advance(self):
-        folder = self.cell.folders[0]
-        if self.stage == 0 and saved_step(folder) > 0 and not is_finished(folder) and self.owner():
-            self.first, self.struck = self.job, self.owner()["pid"]
+        if self.stage == 0 and self.holds():
+            self.first = self.job
             self.strike()
             self.stage = 1
-        elif self.stage == 1 and self.follow_up():
-            self.stage = 2
+        elif self.stage == 1:
+            pending = int(status_of(self.struck).get("ShdPnd", "0"), 16)
+            if self.awaited and all(pending & 1 << (signum - 1) for signum in self.awaited):
+                for sender in self.senders:
+                    sender.kill()
+                    sender.wait()
+                os.kill(self.struck, signal.SIGCONT)  # not every Slurm does that itself
+            if self.follow_up():
+                self.stage = 2
+
+    def is_in_reach(self):
+        return STEPS // 10 <= saved_step(self.cell.folders[0]) <= STEPS // 2
+
+    def holds(self):
+        """Stop the cell's process. Whether it stands still where it is to be struck."""
+        folder, pid = self.cell.folders[0], self.owner()
+        if is_finished(folder):
+            if not self.is_queued():  # over before a look at it: once more
+                for folder in self.cell.folders:
+                    shutil.rmtree(folder)
+                assert self.submit() == 1
+            return False
+        if not pid or not self.is_in_reach():
+            return False
+        self.struck = pid
+        os.kill(pid, signal.SIGSTOP)
+        while not status_of(pid).get("State", "T").startswith("T"):
+            time.sleep(0.01)
+        if pid == self.owner() and self.is_in_reach():
+            return True
+        if status_of(pid):
+            os.kill(pid, signal.SIGCONT)
+        return False
 
 
 class Requeued(Fault):
     """Cancelled, which must not bring it back, and then put back into the queue by its owner."""
 
     def strike(self):
+        # Slurm lets a cancelled process go on, to end it by SIGTERM a moment later. Here it finds one waiting.
+        os.kill(self.struck, signal.SIGTERM)
         self.send("KILL")
 
     def follow_up(self):
@@ -123,46 +175,35 @@ class Requeued(Fault):
 class Resubmitted(Fault):
     """Killed without warning, and found by the next command to be neither finished nor queued."""
 
-    def __init__(self, cell, root, jobs):
-        super().__init__(cell)
-        self.root, self.jobs = root, jobs
-
     def strike(self):
         os.kill(self.struck, signal.SIGKILL)
 
     def follow_up(self):
-        return not self.is_queued() and submit(self.root, self.jobs) >= 1 and self.job != self.first
+        return not self.is_queued() and self.submit() == 1 and self.job != self.first
 
 
 class Preempted(Fault):
-    """Told that its node is wanted: by SIGTERM, and then by the signal that it has asked for."""
+    """Told that its node is wanted: by SIGTERM, and by the signal that it has asked for."""
+
+    awaited = (signal.SIGTERM, signal.SIGUSR2)
 
     def strike(self):
         self.send("TERM", "USR2")
 
     def follow_up(self):
-        if self.owner() and self.owner()["pid"] == self.struck:
-            return False
-        for sender in self.senders:
-            sender.kill()  # what it still tries is meant for a process that has ended
-        return True
+        return not status_of(self.struck)
 
 
 class OutOfTime(Fault):
-    """Held up until Slurm says that its time is almost over, and let go on then: it has a checkpoint to write."""
+    """Held up until Slurm says that its time is almost over: it has a checkpoint to write."""
+
+    awaited = (signal.SIGUSR2,)
 
     def strike(self):
-        os.kill(self.struck, signal.SIGSTOP)
+        pass
 
     def follow_up(self):
-        try:
-            status = Path(f"/proc/{self.struck}/status").read_text()
-            pending = int(next(line.split()[1] for line in status.splitlines() if line.startswith("ShdPnd")), 16)
-            if pending & 1 << (signal.SIGUSR2 - 1):
-                os.kill(self.struck, signal.SIGCONT)  # not every Slurm does that itself
-            return False
-        except (FileNotFoundError, ProcessLookupError):
-            return True
+        return not status_of(self.struck)
 
 
 def test_cells_that_are_killed_preempted_or_out_of_time_end_as_on_one_machine(tmp_path, slurm, capsys):
@@ -172,13 +213,16 @@ def test_cells_that_are_killed_preempted_or_out_of_time_end_as_on_one_machine(tm
     cells = {cell.variant.partition(",")[0]: cell for cell in find_cells(root)}
     assert cells.keys() == {"DPre", "SRad", "NFW", "DAlpha", "SPre+"}
     faults = {
-        "OutOfTime": OutOfTime(cells["NFW"]),
-        "Requeued": Requeued(cells["SRad"]),
+        "OutOfTime": OutOfTime(cells["NFW"], root, slurm),
+        "Requeued": Requeued(cells["SRad"], root, slurm),
         "Resubmitted": Resubmitted(cells["DAlpha"], root, slurm),
-        "Preempted": Preempted(cells["SPre+"]),
+        "Preempted": Preempted(cells["SPre+"], root, slurm),
     }
     deadline = time.monotonic() + PATIENCE
-    while not all(is_finished(folder) for cell in cells.values() for folder in cell.folders):
+    while not (
+        all(fault.stage == 2 for fault in faults.values())
+        and all(is_finished(folder) for cell in cells.values() for folder in cell.folders)
+    ):
         if time.monotonic() > deadline:
             logs = "".join(path.read_text() for path in sorted(root.glob("sweep/slurm/*.err")))
             pytest.fail(f"stages {[(name, f.stage) for name, f in faults.items()]}\n{logs[-5000:]}")
@@ -187,12 +231,11 @@ def test_cells_that_are_killed_preempted_or_out_of_time_end_as_on_one_machine(tm
         time.sleep(0.2)
 
     for fault in faults.values():
-        assert fault.stage == 2
         info = json.loads((fault.cell.folders[0] / "info.json").read_text())
         assert len(info["resumed"]) >= 1 and info["resumed"][0]["step"] > 0
         assert info["command"].startswith("run.py algo=")
     assert faults["Preempted"].job == faults["Preempted"].first and faults["OutOfTime"].job == faults["OutOfTime"].first
-    assert run_command([*WORDS.split(), "threads=1", f"results={tmp_path / 'local'}"]) == 0
+    assert run_command([f"algo={ALGOS}", *WORDS.split(), "threads=1", f"results={tmp_path / 'local'}"]) == 0
     capsys.readouterr()
     assert run_command(["status", str(root)]) == 0
     assert "5 cells: 5 finished" in capsys.readouterr().out

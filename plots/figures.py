@@ -126,6 +126,8 @@ def _draw_training(
             _label_measure(axes, measure)
         for axes in others[len(measures) :]:
             axes.remove()
+        for axes in (first, *others[: len(measures)]):
+            axes.tick_params(labelbottom=True)  # sharing leaves them to the last row, where a column may have no panel
     figure.suptitle(fill(", ".join([f"{task} (mean ± standard error)", *common]), 110))
     longest = max(len(curve.label) for curve in curves)
     figure.legend(loc="outside lower center", ncols=max(1, min(len(curves), 100 // (longest + 8))), frameon=False)

@@ -40,6 +40,21 @@ class Agent(Snapshots):
 
     An algorithm declares its settings, its rows of the paper's table and what it supports in class attributes, and
     implements the abstract methods. It is off-policy: it learns from batches of a replay buffer.
+
+    Its contracts, which `algos.check_algorithm` tries out:
+
+    - Random numbers come from `init` in `build`, from `exploration` (with `which=which`) in acting and from
+      `update_noise` in gradient steps, and from nowhere else: the same command gives the same bits.
+    - A learned parameter has k rows a seed (`networks`). Row i starts from numbers of init[i]. Modules are in
+      `networks`, optimisers in `optimizers`. A module that no optimiser trains takes no gradient.
+    - No seed depends on its neighbours: a loss is the mean over the batch and never over seeds, and `explore`,
+      `start_episode` and `start_rollout` change the rows `which` alone.
+    - What the future depends on beside these is in `memory`, so that a resumed training repeats every bit.
+    - Every loss goes through `descend`, so that a divergence ends its seed.
+    - Executed actions, those of `policy` too, come from the map (`feasible`). `policy` is deterministic, and keeps a
+      copy of its parameters.
+    - `statistics` has the same names in every call, a value a seed.
+    - Where gradient steps differ, `update` counts them in `updates`, and `cycle` is their period.
     """
 
     config_class: ClassVar[type[Config]] = Config

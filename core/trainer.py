@@ -117,7 +117,10 @@ class Trainer:
     def _fail_refused(self) -> None:
         for i, reason in self.guard.refused.items():
             if not self.seeds[i].ended:
-                self._fail(self.seeds[i], f"the constraint of {self.config.env}: {reason}")
+                self._fail(self.seeds[i], self._of_constraint(reason))
+
+    def _of_constraint(self, reason: str) -> str:
+        return f"the constraint of {self.config.env}: {reason}"
 
     def _report(self, error: Exception) -> None:
         """Say where an error came that ends all seeds, and what is left of the training.
@@ -283,7 +286,7 @@ class Trainer:
         with self.guard.of(which) as refused:
             apart = self.guard.apart(lambda obs: policy(obs.to(self.agent.device)).cpu())
             returns = self.evaluator.run(apart, which, episodes)
-        self.evaluator.refused |= refused
+        self.evaluator.refused |= {i: self._of_constraint(reason) for i, reason in refused.items()}
         return returns
 
     def _finish(self, seeds: Sequence[Seed]) -> None:

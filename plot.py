@@ -18,6 +18,7 @@
 options: env=W+M,R+L2 and algo=DPre+,SRad   only these, of a folder of results (default all)
          out=DIR                            write below DIR (default: the folder of results, or results)
          format=md,csv,tex,png,pdf          only these (default all)
+         plugin=my.py                       your own files that register tasks and algorithms
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import tables
-from core.words import ConfigError, parse_words, split_names
+from core.words import ConfigError, closest, parse_words, split_names
 from plots import style
 from plots.aggregates import aggregate, draw_aggregates, improvement_table, mean_table
 from plots.conflicts import keep_apart
@@ -37,6 +38,8 @@ from plots.grouping import Groups, group_runs, list_left_out
 from plots.paper import COLORS, order_algos, order_tasks
 from plots.rewards import comparison_table, reward_table
 from store.folder import find_runs, parse_variant, read_results
+from store.output import forgiving_output
+from sweep.plugins import load_plugins
 
 RESULTS = "results"
 RUNTIME = "bench/results/runtime.csv"
@@ -71,7 +74,8 @@ def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
 def _read(root: Path, options: dict[str, str]) -> Groups:
     """The runs in `root` that the options ask for. Names the unusable ones on stderr."""
     if not root.is_dir():
-        raise ConfigError(f"{root} is not a folder")
+        close = closest(str(root), COMMANDS)
+        raise ConfigError(f"{root} is not a folder" + (f"; did you mean {close}?" if close else ""))
     found = find_runs(root)
     if not found:
         raise ConfigError(f"no runs in {root} (looked for <task>/<algorithm>/seed=<n> in it)")
@@ -162,7 +166,7 @@ COMMANDS = {"tables": plot_tables, "maps": plot_maps, "actions": plot_actions, "
 
 def run(arguments: Sequence[str]) -> list[Path]:
     """Carry out the command line. Returns the files written."""
-    words, options = parse_arguments(arguments)
+    words, options = parse_arguments(load_plugins(arguments))
     if not words or words[0] not in COMMANDS:
         return plot_results(words, options)
     for key in ("env", "algo"):
@@ -177,6 +181,11 @@ NAMED = 4
 
 def main(arguments: Sequence[str]) -> int:
     """Exit code: 0 done, 2 bad input."""
+    with forgiving_output():
+        return _carry_out(arguments)
+
+
+def _carry_out(arguments: Sequence[str]) -> int:
     if not arguments or "--help" in arguments or "-h" in arguments:
         print(__doc__.strip())
         return 0

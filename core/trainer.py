@@ -74,6 +74,7 @@ class Trainer:
         After an Interrupted everything is in a checkpoint. Any early end saves the last parameters.
         """
         self.progress = Progress(self.config, [seed.steps for seed in self.seeds], self.show_progress)
+        self.evaluator.watch = self.progress.evaluation
         try:
             if not self.began:
                 self._begin()

@@ -37,7 +37,11 @@ def module_of(value: Any) -> str:
 def is_user(value: Any) -> bool:
     """Whether a function or a class is the user's own code. One that was typed at a prompt is, too."""
     module = module_of(value)
-    return user_file(module) is not None or (module == "__main__" and not _main_is_command())
+    if is_project(module) or not module:
+        return False
+    if module == "__main__":
+        return not _main_is_command()
+    return module not in sys.modules or user_file(module) is not None
 
 
 def user_files() -> list[Path]:

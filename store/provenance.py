@@ -65,15 +65,20 @@ def _describe_sources(files: Sequence[Path]) -> list[dict[str, Any]]:
 
     A file that no repository has, has no commit. `dirty` tells whether it differs from its commit.
     """
+    inside = [str(file) for file in files if file.is_relative_to(ROOT)]
+    try:
+        tracked = _git(Path(__file__), "ls-files", "--full-name", "--", *inside).splitlines() if inside else []
+    except (OSError, subprocess.SubprocessError):
+        tracked = []
     sources = []
     for file in files:
-        described = _git_describe(file)
-        inside = file.is_relative_to(ROOT)
-        if inside and described:
+        name = str(file.relative_to(ROOT)) if str(file) in inside else file.name
+        if str(file) in inside and name in tracked:
             continue
+        described = _git_describe(file)
         sources.append(
             {
-                "file": str(file.relative_to(ROOT)) if inside else file.name,
+                "file": name,
                 "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
                 "commit": described and described.removesuffix("-dirty"),
                 "dirty": described and _git(file, "status", "--porcelain", "--", file.name) != "",

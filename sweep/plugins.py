@@ -64,6 +64,7 @@ def _load(path: Path) -> None:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         del sys.modules[name], _loaded[path]
+        sys.path.remove(str(path.parent))
         reason = one_line(error) if isinstance(error, Exception) else f"it ends the program ({error})"
         raise ConfigError(f"{KEY} {_place(error, path)}: {type(error).__name__}: {reason}") from error
     _loaded[path] = True

@@ -80,6 +80,7 @@ class Trainer:
         on stderr that names algorithm, task and step.
         """
         self.progress = Progress(self.config, [seed.steps for seed in self.seeds], self.show_progress)
+        self.evaluator.watch = self.progress.evaluation
         try:
             if not self.began:
                 self._sparing(self._begin)

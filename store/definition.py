@@ -156,6 +156,8 @@ class _Describer:
         if is_project(module_of(type(value))):
             # What it was made with. Other attributes, such as results that it keeps, follow from that.
             attributes = _arguments(value, attributes) or attributes
+        elif not is_user(type(value)):
+            attributes = _library_state(value, attributes)
         for name, item in attributes.items():
             self.add(f"{path}.{name}", item)
 
@@ -251,6 +253,17 @@ def _array(array: np.ndarray) -> str:
 def _attributes(value: Any) -> dict[str, Any]:
     slots = (name for base in type(value).__mro__ for name in _slots_of(base))
     return {name: getattr(value, name) for name in slots if hasattr(value, name)} | dict(getattr(value, "__dict__", {}))
+
+
+def _library_state(value: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a network; of another library's object the public numbers and texts, as the rest may change."""
+    if hasattr(value, "state_dict"):
+        return dict(value.state_dict())
+    return {
+        name: item
+        for name, item in attributes.items()
+        if not name.startswith("_") and isinstance(item, (*_PLAIN, np.ndarray))
+    }
 
 
 def _slots_of(base: type) -> Iterator[str]:

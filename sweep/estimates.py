@@ -53,6 +53,15 @@ def _rates() -> dict[tuple[str, str], Rate]:
     return {(row["task"], row["algo"]): Rate(float(row["update_ms"]), float(row["step_ms"])) for row in rows}
 
 
+def is_measured(task: str, algo: str) -> bool:
+    """Whether `_rate` is a measurement of this task, and of this algorithm or one of its family.
+
+    The time of a task of one's own depends most on its set, which can take a hundred times as long as another one.
+    """
+    families = {ALGORITHMS[name].agent.family for _, name in _rates() if name in ALGORITHMS}
+    return task in {name for name, _ in _rates()} and ALGORITHMS[algo].agent.family in families
+
+
 @cache
 def _rate(task: str, algo: str) -> Rate:
     """The measured rate of a cell. Without one: the mean over cells of the same robot and family of algorithms."""

@@ -26,6 +26,7 @@ from store.checkpoint import saved_step
 from store.files import one_line
 from store.folder import has_ended
 from store.lock import LockedError, run_lock
+from store.output import forgiving_output
 from sweep.cells import RECORDS, Cell
 from sweep.exit import Exit, exit_code, stoppable
 from sweep.plan import Entry, make_plan
@@ -185,7 +186,8 @@ class Job:
         requeue: Any = signal.signal(signum, lambda *_: None)
         log, before = environment.paths.stderr, self._progress()
         try:
-            code = exit_code(partial(stoppable, partial(train_cells, [self.cell])))
+            with forgiving_output():
+                code = exit_code(partial(stoppable, partial(train_cells, [self.cell])))
         except Exception:
             self.cell.note_end(1, log)
             raise

@@ -14,7 +14,7 @@ import torch
 
 import envs
 from algos import ALGORITHMS, setting_keys
-from core.config import AUTO, RUN_KEYS, THREADS, Config, saved_settings
+from core.config import AUTO, RUN_KEYS, THREADS, Config
 from core.trainer import Trainer
 from core.words import ConfigError, known_name, parse_words
 from envs import TASKS
@@ -22,11 +22,13 @@ from store.checkpoint import Checkpoint, CheckpointFolder, FormatError, group_ch
 from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
 from store.interrupt import Interrupted
 from store.lock import run_lock
-from store.provenance import describe_environment
+from store.output import forgiving_output
+from store.provenance import command_line, describe_environment
 from sweep.cells import Cell, make_cells
 from sweep.check import check_training
 from sweep.definition import check_definition, define
 from sweep.exit import Exit, stoppable
+from sweep.plugins import load_plugins, refuse_to_train_in_plugin
 
 
 def train_words(words: str) -> bool:
@@ -36,9 +38,11 @@ def train_words(words: str) -> bool:
     program; the same call resumes. Raises ConfigError for wrong words, ConstraintError for a constraint that breaks
     down and LockedError if another process trains a run.
     """
-    cells = make_cells(parse_words(words.split(), setting_keys()))
+    refuse_to_train_in_plugin()
+    cells = make_cells(parse_words(load_plugins(words.split()), setting_keys()))
     try:
-        return stoppable(partial(train_cells, cells)) is Exit.DONE
+        with forgiving_output():
+            return stoppable(partial(train_cells, cells)) is Exit.DONE
     except Interrupted as interrupted:
         raise SystemExit(128 + interrupted.signum) from None
 
@@ -78,20 +82,20 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
         for seed in sorted(ended):
             print(f"{folders[seed]}: {_end_of(folders[seed])} (overwrite=true starts it again and keeps this one)")
         groups, fresh = ([], list(folders)) if config.overwrite else _find_checkpoints(folders, ended)
-        info = describe_environment(["run.py", *cell.words])
-        info |= {"threads": config.threads, "device": _device_name(config.device)}
+        info = describe_environment(sys.orig_argv[1:])
+        info |= {"cell": command_line(cell.words), "threads": config.threads, "device": _device_name(config.device)}
         for group in groups:
             if ended.issuperset(group):  # the process died after the last seed's end
                 for seed in group:
                     CheckpointFolder(folders[seed]).remove()
             else:
-                _resume(config, folders, group, ended, info, definition, stop_if_asked)
+                _resume(cell, folders, group, ended, info, definition, stop_if_asked)
         if fresh:
             info["lockstep"] = fresh
             writers = [
                 RunWriter(
                     folders[seed],
-                    saved_settings(config, seed),
+                    cell.settings(seed),
                     info,
                     config.eval_episodes,
                     replace_finished=config.overwrite,
@@ -200,7 +204,7 @@ def _find_checkpoints(folders: dict[int, Path], ended: set[int]) -> tuple[list[d
 
 
 def _resume(
-    config: Config,
+    cell: Cell,
     folders: dict[int, Path],
     group: dict[int, Checkpoint],
     ended: set[int],
@@ -209,15 +213,15 @@ def _resume(
     stop_if_asked: Callable[[], None],
 ) -> None:
     """Resume the training from the checkpoints of `group`, which were written together."""
-    before = next(iter(group.values())).group
+    config, before = cell.config, next(iter(group.values())).group
     # Seeds that have ended stay in the batch, which keeps its shape. If other seeds are missing, it changes anyway.
     seeds = list(before) if set(before) == set(group) else [seed for seed in group if seed not in ended]
     for seed in seeds:
-        _check_settings(folders[seed], group[seed].settings, saved_settings(config, seed))
+        _check_settings(folders[seed], group[seed].settings, cell.settings(seed))
     writers = []
     for seed in seeds:
         resumed = info | {"step": group[seed].step, "lockstep": seeds}
-        settings = saved_settings(config, seed)
+        settings = cell.settings(seed)
         writers.append(RunWriter.resume(folders[seed], settings, resumed, config.eval_episodes, definition))
         if seed not in ended:
             print(f"{folders[seed]}: resuming from step {group[seed].step}")
@@ -262,7 +266,8 @@ def _run(trainer: Trainer) -> None:
         else:
             print(
                 f"{folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
-                f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e})"
+                f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e}"
+                f"{'; quick=true, for comparison too few' if trainer.config.quick else ''})"
             )
 
 

@@ -116,9 +116,9 @@ class Constraint(ABC):
         """The paper's penalty (...), with finite gradients everywhere. A set with several rows overrides this."""
         return self._violation(at, action).clamp(min=0.0)
 
-    def _center(self, at: Any) -> Tensor | None:
-        """Interior point (..., d), or a single one (d,) for every obs; None for the origin."""
-        return None
+    def _center(self, at: Any) -> Tensor:
+        """Interior point (..., d), or a single one (d,) for every obs. A set with `origin_centered` has none."""
+        raise NotImplementedError(f"{type(self).__name__} needs _center, or origin_centered = True")
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         """The set's rows and ellipses. A part of an `Intersection` must have them; TypeError where it does not."""
@@ -171,9 +171,9 @@ class Constraint(ABC):
         check_tensor("obs", obs)
         if not obs.is_floating_point():
             raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
-        center = self._center(self._at(obs.double()))
-        if center is None:
+        if self.origin_centered:
             return obs.new_zeros(*obs.shape[:-1], self.dim)
+        center = self._center(self._at(obs.double()))
         return center.expand(*obs.shape[:-1], self.dim).to(obs.dtype)
 
     def gauge(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
@@ -200,7 +200,10 @@ class Constraint(ABC):
         """
         obs64, action64 = self._broadcast(obs, action)
         at = self._at(obs64)
-        center64 = self._center(at) if center is None else self._given_center(at, center)
+        if center is None:
+            center64 = None if self.origin_centered else self._center(at)
+        else:
+            center64 = self._given_center(at, center)
         offset = action64 if center64 is None else action64 - center64
         traced = is_traced(center64, *tensors_of(at))
         return Ray(

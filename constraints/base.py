@@ -12,6 +12,7 @@ parameters of learned coefficients exist as well; they take more time, and only 
 
 from __future__ import annotations
 
+import operator
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from constraints.errors import name_samples, require
 from constraints.gauge import box_gauge_gradient, largest_gauge
 from constraints.implicit import Boundary, Solver, differentiable_projection, tensors_of
 from constraints.jacobian import JacobianProduct, with_jacobian
-from constraints.numerics import is_traced, keep_nan, one_where_zero, with_gradient
+from constraints.numerics import is_traced, keep_nan, one_where_zero, refuse_transforms, with_gradient
 from constraints.ray import Ray
 
 AT_FACE = 1.0 - 1e-9
@@ -48,7 +49,7 @@ class ExplicitSet(NamedTuple):
 
 
 class Constraint(ABC):
-    """A feasible set A(obs) inside the box [-1, 1]^dim. ValueError for dim < 1.
+    """A feasible set A(obs) inside the box [-1, 1]^dim. ValueError for dim < 1, TypeError where it is not whole.
 
     A subclass implements the protected methods. They receive float64 tensors; `action` (or `direction`, `gradient`)
     has the common leading shape already. `at` is what `_at(obs)` returned: the observation, if that is not overridden.
@@ -62,7 +63,7 @@ class Constraint(ABC):
     def __init__(self, dim: int):
         if dim < 1:
             raise ValueError(f"dim must be at least 1, got {dim}")
-        self.dim = dim
+        self.dim = operator.index(dim)
         self._center_calls = FirstCalls()
 
     # ---------------------------------------------------------------- what a subclass gives
@@ -249,6 +250,7 @@ class Constraint(ABC):
         It is a constant, without gradients. RuntimeError where the observation or learned coefficients ask for them.
         """
         check_tensor("gradient", gradient)
+        refuse_transforms("linear_oracle")
         obs64, gradient64 = self._broadcast(obs, gradient.detach())
         at = self._at(obs64)
         if torch.is_grad_enabled() and any(value.requires_grad for value in tensors_of(at)):
@@ -294,5 +296,10 @@ class Constraint(ABC):
             raise TypeError(f"expected float32 or float64 actions, got {action.dtype}")
         obs, action = obs.double(), action.double()
         if obs.shape[:-1] != action.shape[:-1]:
-            action = action.expand(*torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1]), self.dim)
+            try:
+                lead = torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1])
+            except RuntimeError:
+                shapes = f"{tuple(obs.shape)} and {tuple(action.shape)}"
+                raise ValueError(f"leading shapes of obs and action do not broadcast: {shapes}") from None
+            action = action.expand(*lead, self.dim)
         return obs, action

@@ -1,8 +1,9 @@
 """Tables and figures of the benchmark.
 
-    python plot.py results/          all runs of a folder of results, finished or not:
+    python plot.py results/          all runs of a folder of results or of published data (docs/data), finished or not:
                                        tables/rewards       mean and standard error of the finished runs
                                        tables/comparison    the same beside the paper's table
+                                       tables/adjusted      Reacher: without the luck of the starts
                                        tables/aggregate     interquartile mean over tasks, with intervals
                                        tables/improvement   probability that one algorithm is better than another
                                        figures/<task>       learning curves, also of runs in progress
@@ -39,6 +40,7 @@ from plots.paper import COLORS, order_algos, order_tasks
 from plots.rewards import comparison_table, reward_table
 from store.folder import find_runs, parse_variant, read_results
 from store.output import forgiving_output
+from store.published import published_cells, read_published
 from sweep.plugins import load_plugins
 
 RESULTS = "results"
@@ -59,6 +61,7 @@ def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
     for table in (
         improvement_table(aggregates),
         mean_table(aggregates),
+        *_tables_of_reacher(groups),
         comparison_table(groups),
         reward_table(groups),
     ):
@@ -76,18 +79,18 @@ def _read(root: Path, options: dict[str, str]) -> Groups:
     if not root.is_dir():
         close = closest(str(root), COMMANDS)
         raise ConfigError(f"{root} is not a folder" + (f"; did you mean {close}?" if close else ""))
-    found = find_runs(root)
+    found = [(folder.parent.parent.name, parse_variant(folder.parent.name)[0]) for folder in find_runs(root)]
+    found += published_cells(root)
     if not found:
-        raise ConfigError(f"no runs in {root} (looked for <task>/<algorithm>/seed=<n> in it)")
-    tasks_there = {folder.parent.parent.name for folder in found}
-    algos_there = {parse_variant(folder.parent.name)[0] for folder in found}
+        raise ConfigError(f"no runs in {root} (looked for <task>/<algorithm>/seed=<n> and <task>/runs.csv in it)")
+    tasks_there, algos_there = ({names[i] for names in found} for i in range(2))
     # The folder gives the choices, so that a new task or algorithm needs no entry here.
     tasks = split_names(f"env in {root}", options.get("env", "all"), order_tasks(tasks_there))
     algos = order_algos(algos_there)
     of_paper = {"paper": [algo for algo in algos if algo in COLORS]}
     algos = split_names(f"algo in {root}", options.get("algo", "all"), algos, of_paper)
     runs, problems = read_results(root, tasks, algos)
-    runs, conflicts = keep_apart(runs)
+    runs, conflicts = keep_apart([*runs, *(published.run for published in read_published(root, tasks, algos))])
     groups, repeated = group_runs(runs)
     for problem in problems + repeated:
         print(f"skipped {problem}", file=sys.stderr)
@@ -98,7 +101,16 @@ def _read(root: Path, options: dict[str, str]) -> Groups:
     return groups
 
 
-# The other commands import late, because PyTorch and the simulators take seconds to load.
+# What follows imports late, because PyTorch and the simulators take seconds to load.
+
+
+def _tables_of_reacher(groups: Groups) -> list[tables.Table]:
+    """The table of returns without the luck of their starts, where there are runs on Reacher."""
+    if not any(condition.task.startswith("R+") for condition in groups):
+        return []
+    from plots.starts import adjusted_table
+
+    return [adjusted_table(groups)]
 
 
 def plot_tables(words: Sequence[str], options: dict[str, str]) -> list[Path]:

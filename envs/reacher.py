@@ -41,6 +41,8 @@ HALF = _single(0.1) / 2  # from a joint to the centre of its arm, and from there
 _TIP = _single(0.11) - HALF  # from the centre of the forearm to the fingertip
 _RADIUS = _single(0.01)  # of the capsules of both arms
 _UPPER, _FORE = 2.0 * HALF, HALF + _TIP  # lengths of the upper arm and, to the fingertip, of the forearm
+REACH = math.sqrt(_UPPER**2 + _FORE**2 + 2.0 * _UPPER * _FORE * math.cos(LIMIT)), _UPPER + _FORE
+"""Least and largest distance of the fingertip from joint 0."""
 _DENSITY = 1000.0
 _MASS = _DENSITY * (4.0 / 3.0 * math.pi * _RADIUS**3 + math.pi * _RADIUS**2 * (2.0 * HALF))  # of an arm
 # Bullet takes the inertia of the bounding box, and that box includes a collision margin of 0.04 m.

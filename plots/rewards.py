@@ -48,7 +48,7 @@ def reward_table(groups: Groups) -> Table:
                 same = SAME_WITHOUT_CONSTRAINT.get(algo) if condition.task == UNCONSTRAINED else None
                 if algo in row:
                     failed = count_failed(groups[condition][algo])
-                    lines = _lines(row[algo], digits) + ((f"{failed} failed",) if failed else ())
+                    lines = describe(row[algo], digits) + ((f"{failed} failed",) if failed else ())
                     cells.append(TableCell(lines, algo in best))
                     record = condition._asdict() | {"algo": algo} | row[algo]._asdict()
                     records.append(record | {"failed": failed, "best_three": int(algo in best)})
@@ -63,7 +63,8 @@ def reward_table(groups: Groups) -> Table:
     return Table("rewards", title, ["Condition", *algos], 1, sections, records, spans)
 
 
-def _lines(stat: Statistic, digits: int) -> tuple[str, ...]:
+def describe(stat: Statistic, digits: int) -> tuple[str, ...]:
+    """Mean, standard error, and the number of seeds unless it is the paper's."""
     error = f"± {stat.se:.{digits}f}" if stat.n > 1 else ""
     count = f"n={stat.n}" if stat.n != PAPER_SEEDS else ""
     return tuple(filter(None, (f"{stat.mean:.{digits}f}", error, count)))
@@ -90,8 +91,8 @@ def comparison_table(groups: Groups) -> Table:
                     text_cells(
                         condition.label,
                         algo,
-                        " ".join(_lines(ours, digits)),
-                        " ".join(_lines(theirs, digits)),
+                        " ".join(describe(ours, digits)),
+                        " ".join(describe(theirs, digits)),
                         f"{difference:+.{digits}f}",
                         f"{joint:+.1f}" if ours.n > 1 else MISSING,
                     )

@@ -1,0 +1,144 @@
+"""Publish finished runs: add them to the data that the repository carries.
+
+    python bench/publish.py results/                         # every cell of it, to docs/data
+    python bench/publish.py results/ env=R+L2 algo=DPre+     # these cells only
+    python bench/publish.py results/ out=DIR                 # to another folder
+
+A cell (task, algorithm and settings) is published with all its seeds or not at all, so that no seed is dropped. A run
+is refused where it has not ended, where its provenance is missing, names uncommitted changes or more than one commit,
+where its settings are not those that its folder says, and where the same run is there already with another content.
+The command names every refused run with the reason, publishes the other cells, and exits with code 1.
+
+The files are described in store/published.py; `python plot.py docs/data` makes tables and figures from them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+# Scripts find modules beside themselves; those needed here lie in the project.
+sys.path[0] = str(Path(__file__).resolve().parents[1])
+
+from algos import ALGORITHMS, saved_config
+from core.config import differences
+from core.words import ConfigError, parse_words, split_names
+from envs import TASKS
+from store.files import one_line
+from store.folder import Run, find_runs, has_ended, parse_variant, read_run, variant_folder, variant_name
+from store.published import PublishedRun, read_published, write_published
+from sweep.cells import paper_config
+
+OUT = "docs/data"
+
+
+class RefusedError(Exception):
+    """A run that must not be published; the message says why."""
+
+
+def publish(root: Path, out: Path, tasks: Sequence[str], algos: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Publish the cells of `root`; the published runs and the refused ones, a line each."""
+    cells: dict[tuple[str, str], list[Path]] = defaultdict(list)
+    for folder in find_runs(root):
+        task, variant = folder.parent.parent.name, folder.parent.name
+        if task in tasks and parse_variant(variant)[0] in algos:
+            cells[task, variant].append(folder)
+    if not cells:
+        raise ConfigError(f"no runs of these tasks and algorithms in {root}")
+    there = {(run.run.task, *run.key): run for run in read_published(out)}
+    fresh: dict[str, list[PublishedRun]] = defaultdict(list)
+    published, refused = [], []
+    for (task, variant), folders in cells.items():
+        ready, problems = [], []
+        for folder in folders:
+            try:
+                run = checked(folder)
+                if is_new(there.get((task, *run.key)), run):
+                    ready.append(run)
+            except RefusedError as error:
+                problems.append(f"{folder}: {error}")
+        if problems:
+            refused += problems
+        else:
+            fresh[task] += ready
+            published += [f"{task} {variant} seed {run.run.seed}: {run.state}" for run in ready]
+    for task, runs in fresh.items():
+        if runs:
+            write_published(out / task, [run for (name, *_), run in there.items() if name == task] + runs)
+    return published, refused
+
+
+def checked(folder: Path) -> PublishedRun:
+    """The run in `folder`. Raises RefusedError with the reason why it must not be published."""
+    if not has_ended(folder):
+        raise RefusedError("it has not ended")
+    try:
+        run = read_run(folder)
+        info = json.loads((folder / "info.json").read_text())
+    except (OSError, ValueError) as error:
+        raise RefusedError(one_line(error)) from error
+    _check_provenance(info)
+    _check_settings(run)
+    return PublishedRun(run, info)
+
+
+def _check_provenance(info: Mapping[str, Any]) -> None:
+    parts = [info, *info.get("resumed", [])]
+    commits = list(dict.fromkeys(part.get("commit") for part in parts))
+    if None in commits:
+        raise RefusedError("its commit is not known")
+    if any(part.get("dirty") is not False for part in parts):
+        raise RefusedError("it ran with uncommitted changes")
+    if len(commits) > 1:
+        raise RefusedError(f"its parts ran at different commits: {', '.join(commits)}")
+
+
+def _check_settings(run: Run) -> None:
+    if run.task not in TASKS or run.algo not in ALGORITHMS:
+        raise RefusedError(f"{run.algo} on {run.task} is not of this project")
+    config = saved_config(run.config)
+    variant = variant_folder(variant_name(config.algo, differences(config, paper_config(config.algo, config.env))))
+    for says, holds in ((run.task, config.env), (run.variant, variant), ((run.seed,), config.seeds)):
+        if says != holds:
+            raise RefusedError(f"its folder says {says}, its config.yaml {holds}")
+    if run.result is not None and run.result["steps"] != config.steps:
+        raise RefusedError(f"it has {run.result['steps']} steps of {config.steps}")
+
+
+def is_new(there: PublishedRun | None, run: PublishedRun) -> bool:
+    """Whether `run` is new. Raises RefusedError where the same run is there already with another content."""
+    if there is None:
+        return True
+    if there.row() != run.row():
+        raise RefusedError("it is published already, with another content")
+    return False
+
+
+def main(argv: Sequence[str]) -> int:
+    if not argv or argv[0].startswith("-") or "=" in argv[0]:
+        print(__doc__)
+        return 0 if argv and argv[0] in ("-h", "--help") else 2
+    root = Path(argv[0]).expanduser()
+    try:
+        words = parse_words(argv[1:], ("env", "algo", "out"))
+        if not root.is_dir():
+            raise ConfigError(f"{root} is not a folder")
+        tasks = split_names("task", words.get("env", "all"), TASKS)
+        algos = split_names("algorithm", words.get("algo", "all"), ALGORITHMS)
+        published, refused = publish(root, Path(words.get("out", OUT)).expanduser(), tasks, algos)
+    except (ConfigError, ValueError) as error:
+        print(f"publish.py: {one_line(error)}", file=sys.stderr)
+        return 2
+    for line in published or ["nothing new to publish"]:
+        print(line)
+    for line in refused:
+        print(f"refused {line}", file=sys.stderr)
+    return 1 if refused else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

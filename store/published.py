@@ -1,0 +1,197 @@
+"""Published runs: the runs of a task in three files that people can read, without parameters and checkpoints.
+
+    docs/data/<task>/
+        runs.csv            one row a run: algo, variant, seed, state, return_mean, best_step, commit, and, as JSON,
+                            what config.yaml, info.json and result.json (or failed.json) of its folder hold
+        evaluations.csv.gz  algo, variant, seed, then the columns of the runs' evaluations.csv
+        training.csv.gz     algo, variant, seed, then the columns of the runs' training.csv; not there if no run has any
+
+`variant` is the name of the run's folder in results/ (store/folder.py). `state` is "finished", "failed" for a run that
+diverged, or "stopped" for one that was not trained to its end. A run without a value in some column has an empty
+field there. Numbers have all their digits, so that a published run equals its folder in every bit.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import json
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from store.files import replace_file
+from store.folder import Evaluations, Run, parse_variant
+
+RUNS, EVALUATIONS, TRAINING = "runs.csv", "evaluations.csv.gz", "training.csv.gz"
+KEY = ("algo", "variant", "seed")
+"""What tells the runs of a task apart: the first columns of each file."""
+
+Key = tuple[str, str, int]
+
+
+@dataclass(frozen=True)
+class PublishedRun:
+    """A run with its provenance."""
+
+    run: Run
+    info: Mapping[str, Any]
+    """The content of its info.json."""
+
+    @property
+    def key(self) -> Key:
+        return self.run.algo, self.run.variant, self.run.seed
+
+    @property
+    def state(self) -> str:
+        return "finished" if self.run.result else "failed" if self.run.failure else "stopped"
+
+    def row(self) -> dict[str, Any]:
+        """Its row of runs.csv."""
+        end = self.run.result or self.run.failure or {}
+        return {
+            **dict(zip(KEY, self.key, strict=True)),
+            "state": self.state,
+            "return_mean": end.get("return_mean"),
+            "best_step": end.get("best_step"),
+            "commit": self.info.get("commit"),
+            "config": json.dumps(self.run.config),
+            "info": json.dumps(dict(self.info)),
+            "end": json.dumps(end),
+        }
+
+
+def published_cells(root: str | Path) -> list[tuple[str, str]]:
+    """Task and algorithm of every run in `root`."""
+    cells = (
+        (path.parent.name, row["algo"]) for path in sorted(Path(root).glob(f"*/{RUNS}")) for row in _read_table(path)
+    )
+    return list(dict.fromkeys(cells))
+
+
+def read_published(
+    root: str | Path, tasks: Collection[str] | None = None, algos: Collection[str] | None = None
+) -> list[PublishedRun]:
+    """The runs in `root`, of the given tasks and algorithms. Raises a ValueError that names a corrupt file."""
+    runs = []
+    for path in sorted(Path(root).glob(f"*/{RUNS}")):
+        if tasks is None or path.parent.name in tasks:
+            runs += [run for run in _read_task(path.parent) if algos is None or run.run.algo in algos]
+    return runs
+
+
+def write_published(folder: str | Path, runs: Iterable[PublishedRun]) -> None:
+    """Replace the files in `folder`, which is that of a task, by those of `runs`."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    runs = sorted(runs, key=lambda run: run.key)
+    # runs.csv comes last: it lists what the other files must hold.
+    _write_table(folder / EVALUATIONS, [row for run in runs for row in _evaluation_rows(run)])
+    if training := [row for run in runs for row in _training_rows(run)]:
+        _write_table(folder / TRAINING, training)
+    _write_table(folder / RUNS, [run.row() for run in runs])
+
+
+def _evaluation_rows(run: PublishedRun) -> list[dict[str, Any]]:
+    table = run.run.evaluations
+    return [
+        dict(zip(KEY, run.key, strict=True))
+        | {"step": int(step), "return_mean": float(mean)}
+        | {f"return_{k + 1}": float(value) for k, value in enumerate(returns)}
+        | {"seconds": float(seconds)}
+        for step, mean, returns, seconds in zip(*table, strict=True)
+    ]
+
+
+def _training_rows(run: PublishedRun) -> list[dict[str, Any]]:
+    columns = run.run.training
+    return [
+        dict(zip(KEY, run.key, strict=True))
+        | {"step": int(values[0])}
+        | dict(zip(list(columns)[1:], map(float, values[1:]), strict=True))
+        for values in zip(*columns.values(), strict=True)
+    ]
+
+
+def _read_task(folder: Path) -> list[PublishedRun]:
+    evaluations, training = _by_run(folder / EVALUATIONS), _by_run(folder / TRAINING)
+    runs = []
+    for row in _read_table(folder / RUNS):
+        key = _key(row)
+        try:
+            config, info, end = (json.loads(row[column]) for column in ("config", "info", "end"))
+        except (KeyError, ValueError) as error:
+            raise ValueError(f"{folder / RUNS}: {' '.join(map(str, key))}: {error}") from error
+        run = Run(
+            folder=folder / row["variant"] / f"seed={row['seed']}",
+            task=folder.name,
+            algo=row["algo"],
+            variant=row["variant"],
+            overrides=parse_variant(str(config.get("variant", row["variant"])))[1],
+            seed=int(row["seed"]),
+            config=config,
+            evaluations=_evaluations(evaluations.get(key, [])),
+            training=_columns(training.get(key, [])),
+            result=end if row["state"] == "finished" else None,
+            failure=end if row["state"] == "failed" else None,
+        )
+        runs.append(PublishedRun(run, info))
+    return runs
+
+
+def _key(row: Mapping[str, str]) -> Key:
+    return row["algo"], row["variant"], int(row["seed"])
+
+
+def _by_run(path: Path) -> dict[Key, list[dict[str, str]]]:
+    """The rows of each run in the file `path`; no runs if there is no such file."""
+    if not path.exists():
+        return {}
+    return {key: list(rows) for key, rows in groupby(_read_table(path), _key)}
+
+
+def _columns(rows: Sequence[Mapping[str, str]]) -> dict[str, np.ndarray]:
+    """The columns of a run's rows that are not empty, without the key."""
+    names = [name for name, text in rows[0].items() if text and name not in KEY] if rows else []
+    return {name: np.array([float(row[name]) for row in rows]) for name in names}
+
+
+def _evaluations(rows: Sequence[Mapping[str, str]]) -> Evaluations:
+    columns = _columns(rows)
+    if not columns:
+        return Evaluations(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 0)), np.zeros(0))
+    returns = [values for name, values in columns.items() if name.startswith("return_") and name != "return_mean"]
+    return Evaluations(
+        columns["step"].astype(np.int64), columns["return_mean"], np.stack(returns, -1), columns["seconds"]
+    )
+
+
+def _read_table(path: Path) -> list[dict[str, str]]:
+    text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    rows = list(csv.DictReader(io.StringIO(text.decode(), newline="")))
+    if rows and not set(KEY) <= rows[0].keys():
+        raise ValueError(f"{path}: no column {' or '.join(set(KEY) - rows[0].keys())}")
+    return rows
+
+
+def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    columns = dict.fromkeys(name for row in rows for name in row)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(columns), lineterminator="\n", restval="")
+    writer.writeheader()
+    writer.writerows({name: _text(value) for name, value in row.items()} for row in rows)
+    content = text.getvalue().encode()
+    # Without a time in the header, the same runs make the same file.
+    replace_file(path, lambda file: file.write(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content))
+
+
+def _text(value: Any) -> Any:
+    if isinstance(value, float):
+        return "nan" if math.isnan(value) else repr(value)
+    return "" if value is None else value

@@ -1,0 +1,136 @@
+"""Published runs: equal to their folders in every bit; what must not be published is refused."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from synthetic import write_results
+
+from bench.publish import main
+from store.folder import read_results, read_run
+from store.published import PublishedRun, published_cells, read_published, write_published
+
+COMMIT = "0123456789012345678901234567890123456789"
+
+
+@pytest.fixture
+def results(tmp_path):
+    """Two seeds of SRad and of DPre on R+L2, finished, from a clean commit."""
+    root = tmp_path / "results"
+    write_results(root, [("R+L2", "default")], ("DPre", "SRad"), seeds=2, evaluations=12)
+    for folder in root.glob("*/*/seed=*"):
+        result = json.loads((folder / "result.json").read_text())
+        (folder / "result.json").write_text(json.dumps(result | {"steps": 300_000, "best_step": 60_000}))
+        (folder / "info.json").write_text(json.dumps({"commit": COMMIT, "dirty": False}))
+    return root
+
+
+def contents(run):
+    return {
+        "names": (run.task, run.algo, run.variant, run.overrides, run.seed),
+        "config": run.config,
+        "evaluations": {name: values.tolist() for name, values in run.evaluations._asdict().items()},
+        "training": {name: values.tolist() for name, values in run.training.items()},
+        "end": (run.result, run.failure),
+    }
+
+
+def publish(root, out, *words):
+    return main([str(root), f"out={out}", *words])
+
+
+def test_published_runs_equal_their_folders(results, tmp_path, capsys):
+    out = tmp_path / "data"
+    assert publish(results, out) == 0
+    assert capsys.readouterr().out.count("finished") == 4
+    folders, problems = read_results(results)
+    published = [published.run for published in read_published(out)]
+    assert len(folders) == 4 and not problems
+    assert [contents(run) for run in folders] == [contents(run) for run in published]
+    assert all(p.info == {"commit": COMMIT, "dirty": False} for p in read_published(out))
+    assert published_cells(out) == [("R+L2", "DPre"), ("R+L2", "SRad")]
+    assert {run.run.algo for run in read_published(out, algos=["SRad"])} == {"SRad"}
+    assert read_published(out, tasks=["W+M"]) == []
+
+
+def test_the_same_runs_make_the_same_files(results, tmp_path):
+    assert publish(results, tmp_path / "one") == publish(results, tmp_path / "two", "algo=SRad") == 0
+    assert publish(results, tmp_path / "two") == 0
+    for file in (tmp_path / "one" / "R+L2").iterdir():
+        assert file.read_bytes() == (tmp_path / "two" / "R+L2" / file.name).read_bytes()
+
+
+def test_failed_and_stopped_runs_keep_their_state(results, tmp_path):
+    failed, stopped = sorted(results.glob("R+L2/DPre/seed=*"))
+    (failed / "result.json").unlink()
+    (failed / "failed.json").write_text(json.dumps({"step": 7, "quantity": "actor loss is not finite"}))
+    (stopped / "result.json").unlink()
+    runs = [PublishedRun(read_run(folder), {}) for folder in (failed, stopped)]
+    write_published(tmp_path / "data" / "R+L2", runs)
+    published = read_published(tmp_path / "data")
+    assert [run.state for run in published] == ["failed", "stopped"]
+    assert published[0].run.failure == {"step": 7, "quantity": "actor loss is not finite"}
+    assert np.array_equal(published[1].run.evaluations.returns, runs[1].run.evaluations.returns)
+
+
+def unfinished(folder):
+    (folder / "result.json").unlink()
+
+
+def edited(name, change):
+    def edit(folder):
+        path = folder / name
+        parse, write = (yaml.safe_load, yaml.safe_dump) if name.endswith("yaml") else (json.loads, json.dumps)
+        path.write_text(write(parse(path.read_text()) | change))
+
+    return edit
+
+
+REFUSED = {
+    "it has not ended": unfinished,
+    "its commit is not known": edited("info.json", {"commit": None}),
+    "uncommitted changes": edited("info.json", {"dirty": True}),
+    "uncommitted": edited("info.json", {"resumed": [{"commit": COMMIT, "dirty": True}]}),
+    "different commits": edited("info.json", {"resumed": [{"commit": "4" * 40, "dirty": False}]}),
+    "its config.yaml DPre,batch_size=7": edited("config.yaml", {"batch_size": 7}),
+    "its config.yaml R+M": edited("config.yaml", {"env": "R+M"}),
+    "its folder says (1,)": edited("config.yaml", {"seed": "3"}),
+    "it has 5 steps of 300000": edited("result.json", {"steps": 5}),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+def test_a_refused_run_keeps_its_whole_cell_back(results, tmp_path, capsys, reason):
+    REFUSED[reason](results / "R+L2" / "DPre" / "seed=1")
+    assert publish(results, tmp_path / "data") == 1
+    errors = capsys.readouterr().err
+    assert "DPre/seed=1" in errors and reason in errors
+    assert [run.key for run in read_published(tmp_path / "data")] == [("SRad", "SRad", 0), ("SRad", "SRad", 1)]
+
+
+def test_a_published_run_is_not_replaced(results, tmp_path, capsys):
+    out = tmp_path / "data"
+    assert publish(results, out) == 0
+    before = (out / "R+L2" / "runs.csv").read_bytes()
+    capsys.readouterr()
+    assert publish(results, out) == 0
+    assert capsys.readouterr().out == "nothing new to publish\n"
+    edited("result.json", {"return_mean": 99.0})(results / "R+L2" / "SRad" / "seed=0")
+    assert publish(results, out) == 1
+    assert "published already" in capsys.readouterr().err
+    assert (out / "R+L2" / "runs.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (["nowhere"], "nowhere is not a folder"),
+        (["{results}", "algo=SRat"], "did you mean SRad?"),
+        (["{results}", "env=W+M"], "no runs of these tasks"),
+        (["{results}", "to=x"], "unknown key 'to'"),
+    ],
+)
+def test_wrong_words_are_refused(results, tmp_path, capsys, words, message):
+    assert main([word.format(results=results) for word in words]) == 2
+    assert message in capsys.readouterr().err

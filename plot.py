@@ -7,7 +7,7 @@
                                        tables/aggregate     interquartile mean over tasks, with intervals
                                        tables/improvement   probability that one algorithm is better than another
                                        figures/<task>       learning curves, also of runs in progress
-                                       figures/<task>-training   return, temperature and entropy of SAC, all settings
+                                       figures/<task>-training   return and training measures, all settings
                                        figures/aggregate, figures/improvement
     python plot.py tables            tables/tasks and tables/hyperparameters, from the code's definitions
     python plot.py maps              figures/maps: the three feasibility maps, the paper's Figure 1
@@ -17,6 +17,7 @@
                                      (default bench/results/runtime.csv)
 
 options: env=W+M,R+L2 and algo=DPre+,SRad   only these, of a folder of results (default all)
+         paper=beside                       the paper's columns beside ours in tables/rewards
          out=DIR                            write below DIR (default: the folder of results, or results)
          format=md,csv,tex,png,pdf          only these (default all)
          plugin=my.py                       your own files that register tasks and algorithms
@@ -30,14 +31,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import tables
-from core.words import ConfigError, closest, parse_words, split_names
+from core.words import ConfigError, closest, known_name, parse_words, split_names
 from plots import style
 from plots.aggregates import aggregate, draw_aggregates, improvement_table, mean_table
 from plots.conflicts import keep_apart
 from plots.figures import draw_curves
-from plots.grouping import Groups, group_runs, list_left_out
+from plots.grouping import DAGGER, Groups, group_runs, list_diverged, list_left_out
 from plots.paper import COLORS, order_algos, order_tasks
 from plots.rewards import comparison_table, reward_table
+from plots.style import own_algos
 from store.folder import find_runs, parse_variant, read_results
 from store.output import forgiving_output
 from store.published import published_cells, read_published
@@ -51,11 +53,17 @@ def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
     """Plot all runs of a folder of results. Returns the files written."""
     root = _path(words, "folder of results")
     formats = _formats(options, (*tables.FORMATS, *style.FORMATS))
+    if "paper" in options:
+        known_name("value of paper", options["paper"], ["beside"])
     groups = _read(root, options)
     out = Path(options.get("out", root)).expanduser()
     aggregates = aggregate(groups)
     left_out = list_left_out(groups)
+    diverged = list_diverged(groups)
     note = "Not in the tables:\n" + "".join(f"- {line}\n" for line in left_out) if left_out else ""
+    if diverged:
+        note += "\n" * bool(note) + f"{DAGGER} In the tables:\n" + "".join(f"- {line}\n" for line in diverged)
+    own = own_algos(algo for by_algo in groups.values() for algo in by_algo)
     written = []
     # A screen shows the last lines, so the main table comes last.
     for table in (
@@ -63,15 +71,15 @@ def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
         mean_table(aggregates),
         *_tables_of_reacher(groups),
         comparison_table(groups),
-        reward_table(groups),
+        reward_table(groups, beside="paper" in options),
     ):
         if table.records:
             tables.print_table(table)
             written += tables.write_table(table, out / "tables", formats, note)
     if note:
         print(note)
-    written += draw_curves(groups, out / "figures", formats)
-    return written + draw_aggregates(aggregates, out / "figures", formats)
+    written += draw_curves(groups, own, out / "figures", formats)
+    return written + draw_aggregates(aggregates, own, out / "figures", formats)
 
 
 def _read(root: Path, options: dict[str, str]) -> Groups:
@@ -90,7 +98,8 @@ def _read(root: Path, options: dict[str, str]) -> Groups:
     of_paper = {"paper": [algo for algo in algos if algo in COLORS]}
     algos = split_names(f"algo in {root}", options.get("algo", "all"), algos, of_paper)
     runs, problems = read_results(root, tasks, algos)
-    runs, conflicts = keep_apart([*runs, *(published.run for published in read_published(root, tasks, algos))])
+    runs += [published.run for published in read_published(root, tasks, algos)]
+    runs, conflicts = keep_apart(runs)
     groups, repeated = group_runs(runs)
     for problem in problems + repeated:
         print(f"skipped {problem}", file=sys.stderr)
@@ -159,7 +168,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]
     """Words and options. Raises ConfigError for an unknown option, one given twice or without a value."""
     # The path of a run holds a "=" itself, after a "/".
     words = [argument for argument in arguments if "/" in argument.partition("=")[0] or "=" not in argument]
-    return words, parse_words((a for a in arguments if a not in words), ("env", "algo", "out", "format"))
+    return words, parse_words((a for a in arguments if a not in words), ("env", "algo", "paper", "out", "format"))
 
 
 def _path(words: Sequence[str], what: str) -> Path:
@@ -181,7 +190,7 @@ def run(arguments: Sequence[str]) -> list[Path]:
     words, options = parse_arguments(load_plugins(arguments))
     if not words or words[0] not in COMMANDS:
         return plot_results(words, options)
-    for key in ("env", "algo"):
+    for key in ("env", "algo", "paper"):
         if key in options:
             raise ConfigError(f"{key}= applies to a folder of results, not to {words[0]}")
     return COMMANDS[words[0]](words[1:], options)

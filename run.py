@@ -13,6 +13,7 @@ from store.output import forgiving_output
 from sweep.cells import make_cells
 from sweep.exit import Exit, exit_code, stoppable
 from sweep.launch import launch
+from sweep.play import play
 from sweep.plugins import HELP, KEY, load_plugins
 from sweep.settings import SLURM_PREFIX, SlurmSettings, SweepSettings, parse_sweep
 from sweep.status import describe_status
@@ -30,6 +31,7 @@ def usage() -> str:
         "  python run.py algo=paper env=all seed=0-9 jobs=4   a queue of cells, four at a time, a process each",
         "  python run.py algo=paper env=all seed=0-9 launcher=slurm slurm.hours=12    an array of Slurm jobs",
         "  python run.py status results/                      how all cells stand, running, queued or ended",
+        "  python run.py play FOLDER [episodes=3] [which=best] [video=FILE.mp4]    run and film the policy of a run",
         "",
         f"algo: {' '.join(ALGORITHMS)}; paper (the paper's own) or all",
         f"env:  {' '.join(TASKS)}; or all",
@@ -49,7 +51,7 @@ def carry_out(arguments: Sequence[str], stop_if_asked: Callable[[], None]) -> Ex
     sweep, settings = parse_sweep(load_plugins(arguments))
     cells = make_cells(settings)
     if sweep.wanted:
-        return launch(sweep, cells, "threads" in settings, stop_if_asked)
+        return launch(sweep, cells, stop_if_asked)
     return train_cells(cells, stop_if_asked)
 
 
@@ -61,6 +63,8 @@ def main(arguments: Sequence[str]) -> int:
             return Exit.DONE
         if arguments[0] == "status":
             return exit_code(lambda: print(describe_status(load_plugins(arguments[1:]))) or Exit.DONE)
+        if arguments[0] == "play":
+            return exit_code(lambda: stoppable(partial(play, load_plugins(arguments[1:]))))
         return exit_code(lambda: stoppable(partial(carry_out, arguments)))
 
 

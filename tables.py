@@ -149,7 +149,7 @@ def _latex_line(texts: Sequence[str]) -> str:
 def _escape(text: str) -> str:
     text = re.sub(r"([&%$#_{}])", r"\\\1", text)
     text = re.sub(r"(?<![\w-])-(?=[\d.])", "$-$", text)
-    return text.replace("±", r"$\pm$").replace("–", "--").replace(">", "$>$")
+    return text.replace("±", r"$\pm$").replace("–", "--").replace(">", "$>$").replace("†", r"$^\dagger$")
 
 
 def write_csv(path: Path, records: Sequence[dict[str, Any]]) -> None:

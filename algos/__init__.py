@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import Field, dataclass, field, fields, make_dataclass
+from dataclasses import Field, dataclass, field, fields, make_dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from algos.nfwpo import NFWPO
+from algos.policy import Policy, constraint_of, restore, settings_of
 from algos.sac import SAC
 from algos.td3 import TD3
 from constraints import Constraint
 from core.agent import Agent
 from core.config import Config, PenaltyConfig, keys_of, restore_settings
 from core.maps import Alpha, Gauge, Map, Placement, Project, Radial
-from core.words import NameTable
+from core.words import NameTable, known_name
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,16 @@ def paper_settings(name: str, task: str, robot: Any, steps: int) -> Config:
     return ALGORITHMS[name].paper_config(name, task, robot.hyperparameters, steps)
 
 
+def check_algorithm(name: str) -> None:
+    """Check the contracts of `core.agent.Agent` on the algorithm `name`, in seconds, with small trainings.
+
+    Raises `algos.check.ContractError`, whose message names the mistake and the remedy; ConfigError for an unknown name.
+    """
+    from algos.check import check  # only here: it trains, and needs what training needs
+
+    check(known_name("algorithm", name, ALGORITHMS), ALGORITHMS[name])
+
+
 def setting_keys() -> dict[str, Field]:
     """Every key of the command line, with the field that describes it: first those that all algorithms have."""
     keys = keys_of(Config)
@@ -115,3 +127,22 @@ def setting_keys() -> dict[str, Field]:
 def saved_config(settings: Mapping[str, Any]) -> Config:
     """The configuration in a run's config.yaml, whose algorithm must be one of `ALGORITHMS`."""
     return restore_settings(ALGORITHMS[settings["algo"]].config_class, settings)
+
+
+def load_policy(folder: str | Path, which: str = "best") -> Policy:
+    """The policy of the run in `folder`, which is finished or not: observations (n,) or (m, n) -> executed actions.
+
+    `which`: "best" has the parameters of the best evaluation so far, "last" those at the end of the training or, while
+    it is unfinished, of its newest checkpoint. Everything is on the CPU.
+
+    Raises ConfigError, a ValueError, for another `which`, for a folder without a run or without these parameters, and
+    for an algorithm or a task that is not known. Import the file that defines your own before.
+    """
+    folder = Path(folder).expanduser()
+    settings = settings_of(folder)
+    known_name("algorithm", settings["algo"], ALGORITHMS)
+    config = replace(saved_config(settings), device="cpu")
+    constraint, obs_dim = constraint_of(config.env)
+    agent = ALGORITHMS[config.algo].build(config, constraint, obs_dim, config.seeds)
+    restore(agent, folder, which)
+    return Policy(agent, constraint)

@@ -19,6 +19,10 @@ from core.config import AT_LEAST_ONE, NOT_NEGATIVE, Config, setting
 from core.networks import MLP, Adam, TwinCritic, frozen_copy, rows_of, soft_update
 from core.replay import Batch
 
+MEASURES = ("critic_loss", "actor_loss", "mean_q")
+"""Columns of training.csv. The critics' loss and value are means over both and over the batch, the value at the actions
+of the batch."""
+
 
 @dataclass
 class TD3Config(Config):
@@ -62,6 +66,8 @@ class TD3(Agent):
         self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
         self.actor_optimizer = Adam(self.actor.parameters(), learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), learning_rate)
+        # Measures of the last step of each kind, a row a seed.
+        self.measures = {name: torch.zeros(len(self.seeds), device=self.device) for name in MEASURES}
 
     def networks(self) -> dict[str, nn.Module]:
         return {
@@ -73,6 +79,12 @@ class TD3(Agent):
 
     def optimizers(self) -> dict[str, Optimizer]:
         return {"actor": self.actor_optimizer, "critic": self.critic_optimizer}
+
+    def memory(self) -> dict[str, Tensor]:
+        return self.measures
+
+    def statistics(self) -> dict[str, Tensor]:
+        return self.measures
 
     @property
     def cycle(self) -> int:
@@ -100,11 +112,14 @@ class TD3(Agent):
         """A step of both critics and, every `policy_delay` steps, of the actor and the targets."""
         q_target = self.bootstrap(batch)
         q = self.critic(batch.obs, batch.action)
-        self.descend("critic", (q - q_target).square().mean(-1))
+        self.descend("critic", losses := (q - q_target).square().mean(-1))
+        self.measures["critic_loss"].copy_(losses.detach().mean(0))
+        self.measures["mean_q"].copy_(q.detach().mean((0, 2)))
 
         self.updates += 1
         if self.updates % self.config.policy_delay == 0:
-            self.descend("actor", self.actor_loss(batch))
+            self.descend("actor", loss := self.actor_loss(batch))
+            self.measures["actor_loss"].copy_(loss.detach())
             soft_update(self.actor_target, self.actor, self.config.tau)
             soft_update(self.critic_target, self.critic, self.config.tau)
 

@@ -101,6 +101,7 @@ def measure_phases(algo: str, seeds: Sequence[int]) -> Phases:
         watches = [
             (trainer.replay, "sample", "replay sampling"),
             (trainer.replay, "add", "storing"),
+            (trainer.replay, "flush", "storing"),
             (agent, "update", "update"),
             (agent, "explore", "exploration"),
             (trainer.evaluator, "run", "evaluation"),

@@ -3,9 +3,10 @@
 from constraints.ball import Ball
 from constraints.base import Constraint
 from constraints.box import Box
+from constraints.coefficients import check_inputs
 from constraints.ellipse import DiagonalEllipse, PlanarEllipse
 from constraints.errors import ConstraintError
-from constraints.general import Intersection, LinearConstraint, QuadraticConstraint
+from constraints.general import Intersection, InUnits, LinearConstraint, QuadraticConstraint
 from constraints.l1_and_ellipse import WeightedL1AndEllipse
 from constraints.weighted import HalfSpace, WeightedL1, WeightedPositivePart
 
@@ -16,6 +17,7 @@ __all__ = [
     "ConstraintError",
     "DiagonalEllipse",
     "HalfSpace",
+    "InUnits",
     "Intersection",
     "LinearConstraint",
     "PlanarEllipse",
@@ -23,4 +25,5 @@ __all__ = [
     "WeightedL1",
     "WeightedL1AndEllipse",
     "WeightedPositivePart",
+    "check_inputs",
 ]

@@ -1,51 +1,72 @@
-"""A ball inside the box (R+L2). Everything is a closed form; only the box alone is cheaper."""
+"""A ball (R+L2). Inside the box everything is a closed form; only the box alone is cheaper."""
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from constraints.base import Constraint, Ellipse, ExplicitSet
-from constraints.ellipse import ellipse_gauge_gradient
+from constraints.coefficients import Bound
+from constraints.ellipse import DiagonalEllipse, ellipse_gauge_gradient
 from constraints.gauge import largest_gauge
 from constraints.jacobian import JacobianProduct
+from constraints.sample import uniform_in_ball
 
 
-class Ball(Constraint):
-    """sum a_i^2 <= bound <= 1, so the box is never active. ValueError for another bound."""
+class _InBox(NamedTuple):
+    """The ball alone: there is nothing that depends on the observation."""
 
-    def __init__(self, bound: float, dim: int):
-        super().__init__(dim)
-        if not 0.0 < bound <= 1.0:
-            raise ValueError(f"a ball in the box has a bound in (0, 1], got {bound}")
-        self.bound = bound
-        self.radius = bound**0.5
+    bound: float
 
-    def explicit(self, obs: Tensor) -> ExplicitSet:
-        identity = torch.eye(self.dim, dtype=obs.dtype, device=obs.device).expand(*obs.shape[:-1], -1, -1)
-        ellipse = Ellipse(identity, obs.new_zeros(self.dim), self.bound)
-        return ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [ellipse])
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        return action.norm(dim=-1) - self.radius  # the trace of the identity is dim already
+class Ball(DiagonalEllipse):
+    """sum a_i^2 <= bound in the box; the bound is a number or a function of obs.
 
-    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+    A number up to 1 keeps the ball inside the box: every method is then one formula, and the box is left out. For
+    others it is a DiagonalEllipse. ValueError for a number that is not positive.
+    """
+
+    def __init__(self, bound: Bound, dim: int):
+        super().__init__(self._ones, bound, dim)
+        self._in_box = None if callable(bound) or bound > 1.0 else _InBox(bound)
+
+    def _ones(self, obs: Tensor) -> Tensor:
+        return obs.new_ones(self.dim)
+
+    def _at(self, obs: Tensor) -> Any:
+        return self._in_box or super()._at(obs)
+
+    def _violation(self, at: Any, action: Tensor) -> Tensor:
+        if self._in_box is None:
+            return super()._violation(at, action)
+        return action.norm(dim=-1) - at.bound**0.5  # the trace of the identity is dim already
+
+    def _project(self, at: Any, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        if self._in_box is None:
+            return super()._project(at, action)
+        radius = at.bound**0.5
         norm = action.norm(dim=-1, keepdim=True)
-        shrink = self.radius / norm.clamp(min=self.radius)
+        shrink = radius / norm.clamp(min=radius)
 
         def product(vector: Tensor) -> Tensor:
-            unit = action / norm.clamp(min=self.radius)
+            unit = action / norm.clamp(min=radius)
             tangent = vector - unit * (unit * vector).sum(-1, keepdim=True)
-            return torch.where(norm > self.radius, shrink * tangent, vector)
+            return torch.where(norm > radius, shrink * tangent, vector)
 
         return action * shrink, product
 
-    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        return torch.nn.functional.normalize(gradient, dim=-1, eps=1e-300) * self.radius
+    def _linear_oracle(self, at: Any, gradient: Tensor) -> Tensor:
+        if self._in_box is None:
+            return super()._linear_oracle(at, gradient)
+        return torch.nn.functional.normalize(gradient, dim=-1, eps=1e-300) * at.bound**0.5
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        return [ellipse_gauge_gradient(direction, direction, center, center, self.bound)]
+    def _gauge_and_gradient(self, at: Any, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
+        if self._in_box is None:
+            return super()._gauge_and_gradient(at, direction, center)
+        return largest_gauge(direction, ellipse_gauge_gradient(direction, direction, center, center, at.bound))
 
-    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
-        # The box is never active.
-        return largest_gauge(direction, *self._gauge_gradients(obs, direction, center))
+    def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+        if self._in_box is None:
+            return super()._sample(obs, count, generator)
+        return self._in_box.bound**0.5 * uniform_in_ball((*obs.shape[:-1], count, self.dim), obs, generator)

@@ -4,24 +4,32 @@ A feasible set is `A(obs)`, convex, inside the action box [-1, 1]^d. Tensors may
 `obs (..., n)` and `action (..., d)` broadcast against each other. Inputs are float32 or float64 and results have the
 dtype of the action. The mathematics is float64 throughout: joint velocities reach 1e6, and feasibility holds to 1e-6.
 That costs little, because the time goes into the number of operations and not into their width.
+
+Gradients with respect to the action are closed forms. Gradients with respect to the observation, a centre and the
+parameters of learned coefficients exist as well; they take more time, and only where a tensor asks for them. Pass
+`obs.detach()` where they are not wanted.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from constraints.checks import ON_BOUNDARY, check_tensor
+from constraints.coefficients import FirstCalls
+from constraints.errors import name_samples, require
 from constraints.gauge import box_gauge_gradient, largest_gauge
+from constraints.implicit import Boundary, Solver, differentiable_projection, tensors_of
 from constraints.jacobian import JacobianProduct, with_jacobian
-from constraints.numerics import keep_nan, one_where_zero, with_gradient
+from constraints.numerics import is_traced, keep_nan, one_where_zero, with_gradient
 from constraints.ray import Ray
+from constraints.sample import hit_and_run
 
-Coefficients = Callable[[Tensor], Tensor]
-"""Maps observations (..., n) to a constraint's state-dependent coefficients (..., d) or (..., d, d)."""
+AT_FACE = 1.0 - 1e-9
+"""The box holds a coordinate of a projection that is at least this large: rounding may have moved it off the face."""
 
 
 class Ellipse(NamedTuple):
@@ -44,11 +52,13 @@ class Constraint(ABC):
     """A feasible set A(obs) inside the box [-1, 1]^dim. ValueError for dim < 1.
 
     A subclass implements the protected methods. They receive float64 tensors; `action` (or `direction`, `gradient`)
-    has the common leading shape already. `_project`, `_center` and `_linear_oracle` run without autograd.
+    has the common leading shape already. `at` is what `_at(obs)` returned: the observation, if that is not overridden.
     """
 
     origin_centered: bool = True
     """True where `center(obs)` is the origin for every obs, so that no centre needs to be stored."""
+    on_empty: str = "error"
+    """What happens where no action meets the constraint, "error" or "least"; see `GeneralConstraint`."""
     solved_on_cpu: bool = False
     """True where a solver runs on the CPU, so that a GPU has to wait. No CUDA graph can hold such a set."""
 
@@ -56,39 +66,73 @@ class Constraint(ABC):
         if dim < 1:
             raise ValueError(f"dim must be at least 1, got {dim}")
         self.dim = dim
+        self._center_calls = FirstCalls()
 
     # ---------------------------------------------------------------- what a subclass gives
 
+    def _at(self, obs: Tensor) -> Any:
+        """The coefficients at `obs` (..., n), for the other protected methods, or the observation itself.
+
+        Coefficients are a NamedTuple of float64 tensors (..., k) and numbers.
+        """
+        return obs
+
     @abstractmethod
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
+    def _violation(self, at: Any, action: Tensor) -> Tensor:
         """Excess (...) over the constraint, the box left out."""
 
     @abstractmethod
-    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+    def _project(self, at: Any, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         """Closest feasible point (..., d) and the product with the projection's Jacobian there.
 
         A NaN in the action is a NaN in the point, at least in that coordinate. Otherwise a broken policy would become
         feasible unnoticed.
         """
 
+    def _boundaries(self, at: Any, point: Tensor) -> list[Boundary]:
+        """The surfaces, the box's left out, that can hold a projection which ends at `point` (..., d).
+
+        Gradients of projections with respect to the coefficients need them; RuntimeError where a set has none.
+        """
+        raise RuntimeError(
+            f"projections of {type(self).__name__} have no gradient with respect to the observation or to learned"
+            " coefficients; pass obs.detach(), or coefficients without gradients"
+        )
+
+    def _free(self, point: Tensor) -> Tensor:
+        """The coordinates (..., d) that are held neither by the box nor by a kink of the set at `point`."""
+        return point.abs() < AT_FACE
+
     @abstractmethod
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+    def _gauge_gradients(self, at: Any, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         """Gradients (..., d) of the gauges of the set's parts with respect to `direction`, the box left out.
 
-        They are differentiable in `direction`, and 0 where it is 0. `center` is None for the origin.
+        They are differentiable in `direction`, the centre and the coefficients, and 0 where `direction` is 0. `center`
+        is None for the origin.
         """
 
     @abstractmethod
-    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
+    def _linear_oracle(self, at: Any, gradient: Tensor) -> Tensor:
         """Feasible point (..., d) with the largest inner product with `gradient`."""
 
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
+    def _penalty(self, at: Any, action: Tensor) -> Tensor:
         """The paper's penalty (...), with finite gradients everywhere. A set with several rows overrides this."""
-        return self._violation(obs, action).clamp(min=0.0)
+        return self._violation(at, action).clamp(min=0.0)
 
-    def _center(self, obs: Tensor) -> Tensor:
-        """Interior point (..., d), or a single one (d,) for every obs."""
-        return obs.new_zeros(self.dim)
+    def _center(self, at: Any) -> Tensor | None:
+        """Interior point (..., d), or a single one (d,) for every obs; None for the origin."""
+        return None
+
+    def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+        """Points (..., count, d), uniform in the set. A set with a closed form overrides this."""
+        repeated = obs.unsqueeze(-2)
+        return hit_and_run(
+            lambda direction, point: self.gauge(repeated, direction, point),
+            lambda gradient: self.linear_oracle(obs, gradient),
+            self.center(obs),
+            count,
+            generator,
+        )
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         """The set's rows and ellipses. A part of an `Intersection` must have them; TypeError where it does not."""
@@ -104,7 +148,11 @@ class Constraint(ABC):
         """
         obs64, action64 = self._broadcast(obs, action)
         box = action64.abs().amax(-1) - 1.0
-        return torch.maximum(box, self._violation(obs64, action64)).to(action.dtype)
+        return torch.maximum(box, self._violation(self._at(obs64), action64)).to(action.dtype)
+
+    def contains(self, obs: Tensor, action: Tensor, tolerance: float = 1e-6) -> Tensor:
+        """Whether (...) the action is feasible up to `tolerance`, in the units of `violation`; False for a NaN."""
+        return self.violation(obs, action) <= tolerance
 
     def penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         """Penalty (...) of the '+' algorithms on an action in the box (paper, "Algorithms").
@@ -113,27 +161,38 @@ class Constraint(ABC):
         where both are present.
         """
         obs64, action64 = self._broadcast(obs, action)
-        return self._penalty(obs64, action64).to(action.dtype)
+        return self._penalty(self._at(obs64), action64).to(action.dtype)
 
     def project(self, obs: Tensor, action: Tensor) -> Tensor:
         """Closest feasible point (..., d) in the Euclidean norm, with its exact Jacobian in `action`."""
-        with torch.no_grad():
-            obs64, action64 = self._broadcast(obs, action)
-            projected, jacobian = self._project(obs64, action64)
+        obs64, action64 = self._broadcast(obs, action)
+        at = self._at(obs64)
+        if is_traced(*tensors_of(at)):
+            return self._differentiable_projection(at, action64).to(action.dtype)
+        projected, jacobian = self._project(at, action64.detach())
+        if projected.requires_grad:
+            self._boundaries(at, projected)
         if torch.is_grad_enabled() and action.requires_grad:
             return with_jacobian(action.expand(action64.shape), projected, jacobian)
         return projected.to(action.dtype)
+
+    def least_violation(self, obs: Tensor) -> Tensor:
+        """The least violation (...) that an action in the box can have, at obs (..., n); 0 if the set has one."""
+        return obs.new_zeros(obs.shape[:-1])  # closed forms contain the origin
 
     def center(self, obs: Tensor) -> Tensor:
         """Interior point (..., d) of the set, in the dtype of `obs` (paper, "alpha-Projection Layer").
 
         It is the Chebyshev centre of a linear set, the ellipse's centre otherwise, the origin where both are present.
+        The classes of sets of one's own say what theirs is.
         """
+        check_tensor("obs", obs)
         if not obs.is_floating_point():
             raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
-        with torch.no_grad():
-            center = self._center(obs.detach().double())
-            return center.expand(*obs.shape[:-1], self.dim).to(obs.dtype)
+        center = self._center(self._at(obs.double()))
+        if center is None:
+            return obs.new_zeros(*obs.shape[:-1], self.dim)
+        return center.expand(*obs.shape[:-1], self.dim).to(obs.dtype)
 
     def gauge(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
         """Minkowski functional L (...) >= 0 around an interior `center` (None: the origin must be interior).
@@ -141,10 +200,15 @@ class Constraint(ABC):
         `center + direction / L` is on the boundary; L is convex and positively homogeneous of degree 1.
         """
         obs64, direction64 = self._broadcast(obs, direction)
-        center64 = None if center is None else center.detach().double()
+        at = self._at(obs64)
+        center64 = None if center is None else self._given_center(at, center)
         # L is homogeneous. At length 1, the squares of even the tiniest direction stay above zero.
         size = one_where_zero(direction64.detach().abs().amax(-1))
-        gauge, gradient = self._gauge_and_gradient(obs64, direction64.detach() / size.unsqueeze(-1), center64)
+        if is_traced(center64, *tensors_of(at)):
+            unit = direction64 / size.unsqueeze(-1)
+            gradient = self._gauge_and_gradient(at, unit, center64)[1]
+            return ((gradient * unit).sum(-1) * size).to(direction.dtype)
+        gauge, gradient = self._gauge_and_gradient(at, direction64.detach() / size.unsqueeze(-1), center64)
         return with_gradient(direction64, gauge * size, gradient).to(direction.dtype)
 
     def ray(self, obs: Tensor, action: Tensor, center: Tensor | None = None) -> Ray:
@@ -153,11 +217,13 @@ class Constraint(ABC):
         Offsets are at most 1e150 long, as the squares of longer ones are infinite.
         """
         obs64, action64 = self._broadcast(obs, action)
-        if center is None and not self.origin_centered:
-            center = self.center(obs64)
-        center64 = None if center is None else center.detach().double()
+        at = self._at(obs64)
+        center64 = self._center(at) if center is None else self._given_center(at, center)
         offset = action64 if center64 is None else action64 - center64
-        return Ray(action, center64, offset, lambda direction: self._gauge_and_gradient(obs64, direction, center64))
+        traced = is_traced(center64, *tensors_of(at))
+        return Ray(
+            action, center64, offset, lambda direction: self._gauge_and_gradient(at, direction, center64), traced
+        )
 
     def alpha_map(self, obs: Tensor, action: Tensor, center: Tensor | None = None) -> Tensor:
         """alpha-projection: the feasible point (..., d) closest to `action` on its ray from the centre."""
@@ -193,30 +259,71 @@ class Constraint(ABC):
         return self.ray(obs, action, center).alpha_log_prob(mean, std)
 
     def linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction)."""
+        """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction).
+
+        It is a constant, without gradients. RuntimeError where the observation or learned coefficients ask for them.
+        """
+        check_tensor("gradient", gradient)
+        obs64, gradient64 = self._broadcast(obs, gradient.detach())
+        at = self._at(obs64)
+        if torch.is_grad_enabled() and any(value.requires_grad for value in tensors_of(at)):
+            raise RuntimeError("linear_oracle has no derivatives; pass obs.detach(), or coefficients without gradients")
+        # Only the direction matters. At length 1, the squares of tiny gradients stay above zero.
+        gradient64 = gradient64 / one_where_zero(gradient64.abs().amax(-1, keepdim=True))
+        return keep_nan(self._linear_oracle(at, gradient64), gradient64).to(gradient.dtype)
+
+    def sample(self, obs: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
+        """Feasible points (..., count, d), uniform in each set A(obs), in the dtype of `obs`.
+
+        Random numbers come from `generator`, or from PyTorch's default one. ValueError for count < 1.
+        """
+        if count < 1:
+            raise ValueError(f"count must be at least 1, got {count}")
+        if not obs.is_floating_point():
+            raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
         with torch.no_grad():
-            obs64, gradient64 = self._broadcast(obs, gradient)
-            # Only the direction matters. At length 1, the squares of tiny gradients stay above zero.
-            gradient64 = gradient64 / one_where_zero(gradient64.abs().amax(-1, keepdim=True))
-            return keep_nan(self._linear_oracle(obs64, gradient64), gradient64).to(gradient.dtype)
+            return self._sample(obs.detach().double(), count, generator).to(obs.dtype)
 
     # ---------------------------------------------------------------- shared pieces
 
-    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _differentiable_projection(self, at: Any, action: Tensor) -> Tensor:
+        """The projection (..., d) with gradients by the action and by the tensors of `at`."""
+        return differentiable_projection(Solver(self._project, self._boundaries, self._free), at, action)
+
+    def _gauge_and_gradient(self, at: Any, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         """Gauge (...) of the whole set, box included, and its gradient (..., d), both 0 where `direction` is.
 
-        The gradient is differentiable in `direction`, the gauge is not.
+        The gradient is differentiable as `_gauge_gradients` says, the gauge is not.
         """
         box = box_gauge_gradient(direction, center)
-        return largest_gauge(direction, box, *self._gauge_gradients(obs, direction, center))
+        return largest_gauge(direction, box, *self._gauge_gradients(at, direction, center))
+
+    def _given_center(self, at: Any, center: Tensor) -> Tensor:
+        """A centre (..., d) that was given, in float64. ValueError for another shape, and see `_check_center`."""
+        check_tensor("center", center)
+        if center.shape[-1:] != (self.dim,):
+            raise ValueError(f"expected {self.dim} coordinates of the center, got shape {tuple(center.shape)}")
+        center = center.double()
+        if self._center_calls.wanted():
+            self._check_center(at, center)
+        return center
+
+    @torch.no_grad()
+    def _check_center(self, at: Any, center: Tensor) -> None:
+        """Raise a ConstraintError for a centre that is not inside the set; a NaN is passed on."""
+        if self._center_calls.readable(center):
+            excess = torch.maximum(center.abs().amax(-1) - 1.0, self._violation(at, center))
+            require(~(excess >= -ON_BOUNDARY).flatten(), "the center is not inside the set", name_samples(excess.shape))
 
     def _broadcast(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Both in float64, the action with the common leading shape. ValueError or TypeError for a wrong action."""
-        if action.shape[-1] != self.dim:
-            raise ValueError(f"expected {self.dim} action coordinates, got {action.shape[-1]}")
+        check_tensor("obs", obs)
+        check_tensor("action", action)
+        if action.shape[-1:] != (self.dim,):
+            raise ValueError(f"expected {self.dim} action coordinates, got shape {tuple(action.shape)}")
         if not action.is_floating_point():
             raise TypeError(f"expected float32 or float64 actions, got {action.dtype}")
-        obs, action = obs.detach().double(), action.double()
+        obs, action = obs.double(), action.double()
         if obs.shape[:-1] != action.shape[:-1]:
             action = action.expand(*torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1]), self.dim)
         return obs, action

@@ -61,7 +61,9 @@ def radial_log_det(gauge: Tensor, dim: int) -> Tensor:
 def _quadrature(device: torch.device) -> tuple[Tensor, Tensor]:
     """Gauss-Legendre nodes and weights on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    return torch.as_tensor((nodes + 1) / 2, device=device), torch.as_tensor(weights / 2, device=device)
+    # Whatever the mode of the first caller: autograd takes no tensors that were made in inference mode.
+    with torch.inference_mode(False):
+        return torch.as_tensor((nodes + 1) / 2, device=device), torch.as_tensor(weights / 2, device=device)
 
 
 def log_ray_integral(

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from constraints.base import Coefficients, Constraint, Ellipse, ExplicitSet
-from constraints.errors import check_bound
+from constraints.base import Constraint, Ellipse, ExplicitSet
+from constraints.checks import check_semidefinite
+from constraints.coefficients import Bound, BoundCoefficient, Coefficient, Coefficients, check_not_negative, flat
+from constraints.implicit import Boundary
 from constraints.jacobian import JacobianProduct, deflated_jacobian
 from constraints.numerics import keep_nan, safe_sqrt
 from constraints.scalar_dual import BoxProblem, RowProblem, minimize_under_ellipse
@@ -16,61 +20,79 @@ _FLAT = 1e-280  # a'Qa below this may be the rounding of 0: the ellipse does not
 _MAX_STEPS = 40  # Newton needs 3 to 10
 
 
-class DiagonalEllipse(Constraint):
-    """sum s_i a_i^2 <= bound in the box, s = scale(obs) >= 0; some or all s_i may be 0. ValueError for bound <= 0."""
+class Scales(NamedTuple):
+    """Coefficients of sum s_i a_i^2 <= bound."""
 
-    def __init__(self, scale: Coefficients, bound: float, dim: int):
+    scale: Tensor  # (..., d)
+    bound: Tensor | float  # (..., 1)
+
+
+class DiagonalEllipse(Constraint):
+    """sum s_i a_i^2 <= bound in the box, s = scale(obs) >= 0; some or all s_i may be 0.
+
+    The bound is a number or a function of obs. ValueError for a number that is not positive.
+    """
+
+    def __init__(self, scale: Coefficients, bound: Bound, dim: int):
         super().__init__(dim)
-        check_bound(bound)
-        self.scale = scale
-        self.bound = bound
+        self.scale, self.bound = scale, bound
+        self._scale_at = Coefficient("scale", scale, (dim,), check_not_negative)
+        self._bound_at = BoundCoefficient("bound", bound)
+
+    def _at(self, obs: Tensor) -> Scales:
+        return Scales(self._scale_at(obs), self._bound_at(obs))
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
-        ellipse = Ellipse(torch.diag_embed(self.scale(obs)), obs.new_zeros(self.dim), self.bound)
+        ellipse = Ellipse(torch.diag_embed(self._scale_at(obs)), obs.new_zeros(self.dim), flat(self._bound_at(obs)))
         return ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [ellipse])
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        scale = self.scale(obs)
-        return ellipse_excess((scale * action**2).sum(-1), scale.sum(-1), self.bound, self.dim)
+    def _violation(self, at: Scales, action: Tensor) -> Tensor:
+        scale, bound = at
+        return ellipse_excess((scale * action**2).sum(-1), scale.sum(-1), flat(bound), self.dim)
 
-    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        return minimize_in_ellipse(BoxProblem(action.abs()), action, 1.0, self.scale(obs), self.bound)
+    def _project(self, at: Scales, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        return minimize_in_ellipse(BoxProblem(action.abs()), action, 1.0, *at)
 
-    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        return minimize_in_ellipse(BoxProblem(gradient.abs()), gradient, 0.0, self.scale(obs), self.bound)[0]
+    def _boundaries(self, at: Scales, point: Tensor) -> list[Boundary]:
+        normal = at.scale * point / at.bound
+        return [Boundary((normal * point).sum(-1) - 1.0, 2.0 * normal)]
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        scale = self.scale(obs)
+    def _linear_oracle(self, at: Scales, gradient: Tensor) -> Tensor:
+        return minimize_in_ellipse(BoxProblem(gradient.abs()), gradient, 0.0, *at)[0]
+
+    def _gauge_gradients(self, at: Scales, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        scale, bound = at
         bent = None if center is None else scale * center
-        return [ellipse_gauge_gradient(direction, scale * direction, center, bent, self.bound)]
+        return [ellipse_gauge_gradient(direction, scale * direction, center, bent, bound)]
 
 
 class PlanarEllipse(Constraint):
     """a'Qa <= bound in the box, Q = matrix(obs) (..., 2, 2) positive semi-definite; a slab where Q is singular (R+T).
 
     Projection and oracle are exact by cases: the box alone, the ellipse alone, or one of the box's four faces.
-    ValueError for bound <= 0.
+    The bound is a number or a function of obs. ValueError for a number that is not positive.
     """
 
-    def __init__(self, matrix: Coefficients, bound: float):
+    def __init__(self, matrix: Coefficients, bound: Bound):
         super().__init__(2)
-        check_bound(bound)
-        self.matrix = matrix
-        self.bound = bound
+        self.matrix, self.bound = matrix, bound
+        self._matrix_at = Coefficient("matrix", matrix, (2, 2), check_semidefinite)
+        self._bound_at = BoundCoefficient("bound", bound)
+
+    def _at(self, obs: Tensor) -> _Planar:
+        matrix = self._matrix_at(obs)
+        return _Planar(matrix.diagonal(dim1=-2, dim2=-1), matrix[..., 0, 1:], self._bound_at(obs))
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
-        ellipse = Ellipse(self.matrix(obs), obs.new_zeros(2), self.bound)
+        ellipse = Ellipse(self._matrix_at(obs), obs.new_zeros(2), flat(self._bound_at(obs)))
         return ExplicitSet(obs.new_zeros(0, 2), obs.new_zeros(0), [ellipse])
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        matrix = self.matrix(obs)
-        value = _Planar(matrix, self.bound).value(action).squeeze(-1)
-        return ellipse_excess(value, matrix.diagonal(dim1=-2, dim2=-1).sum(-1), self.bound, 2)
+    def _violation(self, at: _Planar, action: Tensor) -> Tensor:
+        return ellipse_excess(at.value(action).squeeze(-1), at.diagonal.sum(-1), flat(at.bound), 2)
 
-    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        planar = _Planar(self.matrix(obs), self.bound)
+    def _project(self, planar: _Planar, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         boxed = action.clamp(-1.0, 1.0)
-        in_ellipse = planar.value(boxed) <= self.bound
+        in_ellipse = planar.value(boxed) <= planar.bound
         on_ellipse, mu = planar.project(action)
         in_box = on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + _ROUNDING
 
@@ -96,14 +118,17 @@ class PlanarEllipse(Constraint):
             along = vector * slides * torch.cat((face > 1, face < 2), -1)
             return torch.where(in_ellipse, clipped, torch.where(in_box, tangent, along))
 
-        solution = within_ellipse(solution, planar.times(solution), self.bound)
+        solution = within_ellipse(solution, planar.times(solution), planar.bound)
         return keep_nan(solution, action), product
 
-    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        planar = _Planar(self.matrix(obs), self.bound)
+    def _boundaries(self, planar: _Planar, point: Tensor) -> list[Boundary]:
+        normal = planar.times(point) / planar.bound
+        return [Boundary((normal * point).sum(-1) - 1.0, 2.0 * normal)]
+
+    def _linear_oracle(self, planar: _Planar, gradient: Tensor) -> Tensor:
         # The maximiser over the ellipse alone is along inv(Q) gradient = adj(Q) gradient / det Q.
         ascent = planar.adjugate_times(gradient)
-        on_ellipse = ascent * (self.bound / planar.value(ascent).clamp(min=1e-300)).sqrt()
+        on_ellipse = ascent * (planar.bound / planar.value(ascent).clamp(min=1e-300)).sqrt()
         in_box = on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + _ROUNDING
 
         own, other = _mirrored(gradient), _mirrored(gradient.flip(-1))
@@ -113,21 +138,19 @@ class PlanarEllipse(Constraint):
         on_face = _on_face(face, moved.flatten(-2).gather(-1, face))
         best = in_box & ((on_ellipse * gradient).sum(-1, keepdim=True) >= value)
         solution = torch.where(best, on_ellipse, on_face)
-        return within_ellipse(solution, planar.times(solution), self.bound)
+        return within_ellipse(solution, planar.times(solution), planar.bound)
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        planar = _Planar(self.matrix(obs), self.bound)
+    def _gauge_gradients(self, planar: _Planar, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         bent = None if center is None else planar.times(center)
-        return [ellipse_gauge_gradient(direction, planar.times(direction), center, bent, self.bound)]
+        return [ellipse_gauge_gradient(direction, planar.times(direction), center, bent, planar.bound)]
 
 
-class _Planar:
-    """Arithmetic of one symmetric matrix (..., 2, 2) by its entries; vectors are (..., 2), scalars (..., 1)."""
+class _Planar(NamedTuple):
+    """One symmetric matrix (..., 2, 2) by its entries, and a bound. Vectors are (..., 2), scalars (..., 1)."""
 
-    def __init__(self, matrix: Tensor, bound: float):
-        self.bound = bound
-        self.diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-        self.cross = matrix[..., 0, 1:]
+    diagonal: Tensor  # (..., 2)
+    cross: Tensor  # (..., 1)
+    bound: Tensor | float  # (..., 1)
 
     def times(self, vector: Tensor) -> Tensor:
         return torch.addcmul(self.diagonal * vector, self.cross, vector.flip(-1))
@@ -198,7 +221,7 @@ def _on_face(face: Tensor, moved: Tensor) -> Tensor:
 
 
 def minimize_in_ellipse(
-    problem: RowProblem | BoxProblem, target: Tensor, shift: float, scale: Tensor, bound: float
+    problem: RowProblem | BoxProblem, target: Tensor, shift: float, scale: Tensor, bound: Tensor | float
 ) -> tuple[Tensor, JacobianProduct]:
     """Minimiser (..., d) of sum(shift a^2 / 2 - target a) over a problem's set and sum(scale a^2) <= bound.
 
@@ -215,7 +238,7 @@ def minimize_in_ellipse(
     return point, product
 
 
-def within_ellipse(point: Tensor, bent: Tensor, bound: float) -> Tensor:
+def within_ellipse(point: Tensor, bent: Tensor, bound: Tensor | float) -> Tensor:
     """The point (..., d), shrunk where rounding takes it out of point'Q point <= bound; `bent` is Q point."""
     value = (point * bent).sum(-1, keepdim=True)
     return point * (bound / value.clamp(min=bound)).sqrt()

@@ -2,43 +2,74 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 
 from torch import Tensor
 
-SampleName = Callable[[int], str]
-"""Names a sample of a flattened batch, as in 'sample 3' or 'sample (1, 2)'."""
+
+class SampleName:
+    """Names a sample of a flattened batch of shape `lead`, as in 'sample 3' or 'sample (1, 2)'.
+
+    With `chosen`, the batch is a part of that one: its sample i is sample chosen[i] there.
+    """
+
+    def __init__(self, lead: tuple[int, ...], chosen: list[int] | None = None):
+        self._lead, self._chosen = lead, chosen
+
+    def __call__(self, index: int) -> str:
+        position = self.position(index)
+        if not position:
+            return "the only sample"
+        return f"sample {position[0] if len(position) == 1 else position}"
+
+    def position(self, index: int) -> tuple[int, ...]:
+        """The sample's index in each leading dimension."""
+        index = index if self._chosen is None else self._chosen[index]
+        position: list[int] = []
+        for size in reversed(self._lead):
+            index, last = divmod(index, size)
+            position.insert(0, last)
+        return tuple(position)
+
+    def part(self, chosen: list[int]) -> SampleName:
+        """Names for the samples `chosen` of this batch."""
+        return SampleName(self._lead, chosen if self._chosen is None else [self._chosen[i] for i in chosen])
 
 
 class ConstraintError(ValueError):
-    """An operation that the constraint's coefficients, its observation or the set itself do not allow."""
+    """An operation that the constraint's coefficients, its observation or the set itself do not allow.
+
+    `sample` is the position of the sample that caused it, an index for each leading dimension of the observation that
+    the method got (a tuple; empty for a single observation), or None where no sample did.
+    """
+
+    def __init__(self, message: str, sample: tuple[int, ...] | None = None):
+        super().__init__(message)
+        self.sample = sample
+
+    def __reduce__(self):  # so that a copy, as another process gets it, has the sample too
+        return type(self), (str(self), self.sample)
+
+
+class EmptySetError(ConstraintError):
+    """No action meets the constraint of one sample, or none has room around it where a method needs that."""
 
 
 def name_samples(lead: tuple[int, ...]) -> SampleName:
     """Names for a batch of shape `lead`."""
-
-    def name(index: int) -> str:
-        position: list[int] = []
-        for size in reversed(lead):
-            index, last = divmod(index, size)
-            position.insert(0, last)
-        if not position:
-            return "the only sample"
-        return f"sample {position[0] if len(position) == 1 else tuple(position)}"
-
-    return name
+    return SampleName(lead)
 
 
 def check_bound(bound: float) -> None:
-    """Raise a ValueError for a bound that is not positive."""
-    if bound <= 0.0:
-        raise ValueError(f"bound must be positive for the origin to be interior, got {bound}")
+    """Raise a ValueError for a bound that is not positive and finite."""
+    if not 0.0 < bound < math.inf:
+        raise ValueError(f"bound must be positive for the origin to be interior, and finite, got {bound}")
 
 
-def require(valid: Tensor, message: str, name: SampleName) -> None:
-    """Raise a ConstraintError that names the first sample where `valid` (n,), or (n, m) over rows, is False."""
+def require(valid: Tensor, message: str, name: SampleName, error: type[ConstraintError] = ConstraintError) -> None:
+    """Raise an error that names the first sample where `valid` (n,), or (n, m) over rows, is False."""
     if bool(valid.all()):
         return
     first = (~valid).nonzero()[0].tolist()
     row = f", row {first[1]}" if len(first) > 1 else ""
-    raise ConstraintError(f"{name(first[0])}{row}: {message}")
+    raise error(f"{name(first[0])}{row}: {message}", name.position(first[0]))

@@ -2,43 +2,70 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from constraints.base import Coefficients, Constraint, ExplicitSet
-from constraints.ellipse import DiagonalEllipse, minimize_in_ellipse
+from constraints.base import Constraint, ExplicitSet
+from constraints.coefficients import Bound, Coefficients
+from constraints.ellipse import DiagonalEllipse, Scales, minimize_in_ellipse
+from constraints.implicit import Boundary
 from constraints.jacobian import JacobianProduct
-from constraints.weighted import WeightedL1
+from constraints.weighted import WeightedL1, Weights
+
+
+class _Both(NamedTuple):
+    weight: Tensor  # (..., d)
+    weight_bound: Tensor | float  # (..., 1)
+    scale: Tensor  # (..., d)
+    scale_bound: Tensor | float  # (..., 1)
+
+    @property
+    def row(self) -> Weights:
+        return Weights(self.weight, self.weight_bound)
+
+    @property
+    def ellipse(self) -> Scales:
+        return Scales(self.scale, self.scale_bound)
 
 
 class WeightedL1AndEllipse(Constraint):
     """sum |w_i a_i| <= weight_bound and sum s_i a_i^2 <= scale_bound in the box.
 
-    Projection and oracle have two multipliers. The row's is exact for each value of the ellipse's.
+    Bounds are numbers or functions of obs. Projection and oracle have two multipliers. The row's is exact for each
+    value of the ellipse's.
     """
 
-    def __init__(self, weight: Coefficients, weight_bound: float, scale: Coefficients, scale_bound: float, dim: int):
+    def __init__(self, weight: Coefficients, weight_bound: Bound, scale: Coefficients, scale_bound: Bound, dim: int):
         super().__init__(dim)
         self.l1 = WeightedL1(weight, weight_bound, dim)
         self.ellipse = DiagonalEllipse(scale, scale_bound, dim)
 
+    def _at(self, obs: Tensor) -> _Both:
+        return _Both(*self.l1._at(obs), *self.ellipse._at(obs))
+
     def explicit(self, obs: Tensor) -> ExplicitSet:
         return self.l1.explicit(obs)._replace(ellipses=self.ellipse.explicit(obs).ellipses)
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        return torch.maximum(self.l1._violation(obs, action), self.ellipse._violation(obs, action))
+    def _violation(self, at: _Both, action: Tensor) -> Tensor:
+        return torch.maximum(self.l1._violation(at.row, action), self.ellipse._violation(at.ellipse, action))
 
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        return self.l1._penalty(obs, action) + self.ellipse._penalty(obs, action)
+    def _penalty(self, at: _Both, action: Tensor) -> Tensor:
+        return self.l1._penalty(at.row, action) + self.ellipse._penalty(at.ellipse, action)
 
-    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        problem = self.l1.row_problem(obs, action)
-        return minimize_in_ellipse(problem, action, 1.0, self.ellipse.scale(obs), self.ellipse.bound)
+    def _project(self, at: _Both, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        return minimize_in_ellipse(self.l1.row_problem(at.row, action), action, 1.0, *at.ellipse)
 
-    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        problem = self.l1.row_problem(obs, gradient)
-        return minimize_in_ellipse(problem, gradient, 0.0, self.ellipse.scale(obs), self.ellipse.bound)[0]
+    def _boundaries(self, at: _Both, point: Tensor) -> list[Boundary]:
+        return [*self.l1._boundaries(at.row, point), *self.ellipse._boundaries(at.ellipse, point)]
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        parts = self.l1, self.ellipse
-        return [gradient for part in parts for gradient in part._gauge_gradients(obs, direction, center)]
+    def _free(self, point: Tensor) -> Tensor:
+        return self.l1._free(point)
+
+    def _linear_oracle(self, at: _Both, gradient: Tensor) -> Tensor:
+        return minimize_in_ellipse(self.l1.row_problem(at.row, gradient), gradient, 0.0, *at.ellipse)[0]
+
+    def _gauge_gradients(self, at: _Both, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        row = self.l1._gauge_gradients(at.row, direction, center)
+        return row + self.ellipse._gauge_gradients(at.ellipse, direction, center)

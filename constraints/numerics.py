@@ -11,6 +11,11 @@ def one_where_zero(norm: Tensor) -> Tensor:
     return torch.where(norm > 0.0, norm, 1.0)
 
 
+def root_or_one(square: Tensor) -> Tensor:
+    """sqrt (...), and 1 where the square is 0 or NaN, so that one can divide by it; its gradient there is 0."""
+    return torch.where(square > 0.0, square, 1.0).sqrt()
+
+
 def safe_sqrt(square: Tensor) -> Tensor:
     """sqrt with gradient 0 at 0."""
     positive = square > 0.0
@@ -25,6 +30,18 @@ def keep_nan(solution: Tensor, source: Tensor) -> Tensor:
 def times(matrix: Tensor, vector: Tensor) -> Tensor:
     """Product (..., m) of matrices (..., m, d) with vectors (..., d)."""
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def is_transformed() -> bool:
+    """Whether a transform of torch.func is at work, so that tensors may have hidden axes."""
+    return torch._C._are_functorch_transforms_active()
+
+
+def is_traced(*values: object) -> bool:
+    """Whether autograd records what is done with one of the values, or a transform of torch.func is at work."""
+    return is_transformed() or (
+        torch.is_grad_enabled() and any(isinstance(value, Tensor) and value.requires_grad for value in values)
+    )
 
 
 def refuse_second_derivatives() -> None:

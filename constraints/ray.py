@@ -35,6 +35,8 @@ class Ray:
         center: (..., d) or (d,) float64, None for the origin.
         offset: (..., d) float64, action - c with all leading dimensions.
         gauge_of: returns the set's gauge L (...) around c and its gradient (..., d), for offsets (..., d).
+        traced: whether results are differentiated by more than the action: the gradient of the gauge then depends on
+            the centre and on the set's coefficients. Plain autograd does that; without it, gradients are closed forms.
     """
 
     def __init__(
@@ -43,9 +45,12 @@ class Ray:
         center: Tensor | None,
         offset: Tensor,
         gauge_of: Callable[[Tensor], tuple[Tensor, Tensor]],
+        traced: bool = False,
     ):
         self.action, self.center, self.offset = action, center, offset
-        self._gauge_of = gauge_of
+        self._gauge_of, self._traced = gauge_of, traced
+        # Of the time when the ray was made, whatever the mode of the first use.
+        self._grad_enabled = torch.is_grad_enabled() if traced else offset.requires_grad
 
     @property
     def gauge(self) -> Tensor:
@@ -59,18 +64,27 @@ class Ray:
 
     @cached_property
     def _gauge_and_gradient(self) -> tuple[Tensor, Tensor]:
-        # In the autograd mode in which the ray was made, whatever the mode of the first use.
-        with torch.set_grad_enabled(self.offset.requires_grad):
+        with torch.set_grad_enabled(self._grad_enabled):
             gauge, gradient = self._gauge_of(self.offset)
         return gauge.detach(), gradient
 
+    def _differentiable_gauge(self) -> Tensor:
+        """The gauge L (...) of the offset as a function of all that is differentiated by."""
+        if self._traced:
+            return (self.gradient * self.offset).sum(-1)
+        return with_gradient(self.offset, self.gauge, self.gradient)
+
     def alpha_map(self) -> Tensor:
         """alpha-projection (..., d): the feasible point closest to the action on its ray."""
+        if self._traced:
+            return self._from_center(self.offset / self._differentiable_gauge().clamp(min=1.0).unsqueeze(-1))
         factor = self.gauge.clamp(min=1.0).reciprocal()
         return self._scaled(factor, -factor.square() * (self.gauge > 1.0))
 
     def radial_map(self) -> Tensor:
         """Radial squashing (..., d), c + tanh(L)/L (action - c) (paper, Eq. radial squashing)."""
+        if self._traced:
+            return self._from_center(self.offset * _tanh_ratio(self._differentiable_gauge()).unsqueeze(-1))
         gauge = self.gauge.clamp(min=_TINY)
         tanh = gauge.tanh()
         factor = tanh / gauge
@@ -82,6 +96,9 @@ class Ray:
 
         At u = 0 it has no derivative. Value and gradient there are those of phi = 1.
         """
+        if self._traced:
+            offset = self._action64()
+            return self._from_center(offset * self._traced_stretch(_unit(offset)).unsqueeze(-1))
         stretch = self._stretch
         mapped = _Scale.apply(self._action64(), stretch.factor, stretch.direction, stretch.factor, stretch.slope)
         return self._from_center(mapped)
@@ -93,7 +110,7 @@ class Ray:
             unit_ball: measure in unit-ball coordinates, see `log_reach`.
             floor: added to the map's Jacobian determinant, whose exact value may be tiny, before the logarithm.
         """
-        gauge = with_gradient(self.offset, self.gauge, self.gradient)
+        gauge = self._differentiable_gauge()
         log_det = radial_log_det(gauge, self.offset.shape[-1])
         if floor > 0.0:
             log_det = torch.logaddexp(log_det, torch.full_like(log_det, math.log(floor)))
@@ -111,6 +128,14 @@ class Ray:
         Args:
             unit_ball: measure in unit-ball coordinates, see `log_reach`. The gauge cancels in them.
         """
+        dim = self.offset.shape[-1]
+        if self._traced:
+            unit = _unit(self._action64(), _NEAR_CENTER)
+            if unit_ball:
+                log_scale = _largest(unit).log() - one_where_zero(unit.square().sum(-1)).log() / 2.0
+            else:
+                log_scale = self._traced_stretch(unit).log()
+            return (log_prob.double() - dim * log_scale).to(log_prob.dtype)
         stretch = self._stretch
         if unit_ball:
             # log phi - log r = log max_i |u_i| - log |u|, with r = |u| / L(u) the distance to the boundary.
@@ -121,7 +146,7 @@ class Ray:
             value, gradient = stretch.factor.log(), stretch.slope
         size = stretch.size.clamp(min=_NEAR_CENTER).unsqueeze(-1)
         log_scale = with_gradient(self._action64(), value, gradient / size)
-        return (log_prob.double() - self.offset.shape[-1] * log_scale).to(log_prob.dtype)
+        return (log_prob.double() - dim * log_scale).to(log_prob.dtype)
 
     def alpha_log_prob(
         self, mean: Tensor, std: Tensor, unit_ball: bool = False, boundary_weight: float = 1.0
@@ -140,7 +165,7 @@ class Ray:
         inside = self.gauge <= 1.0
         # Inside, harmless stand-ins keep the unused branch finite, and its gradient too.
         spread = inside.unsqueeze(-1)
-        gauge = with_gradient(offset, self.gauge, self.gradient)
+        gauge = self._differentiable_gauge()
         to_boundary = torch.where(spread, 1.0, offset / torch.where(inside, 1.0, gauge).unsqueeze(-1))
         origin = torch.zeros_like(offset) if self.center is None else self.center.expand_as(offset)
         # The boundary's element of surface is reach^d |grad L| times the unit sphere's. A gradient of length 1 here
@@ -160,7 +185,7 @@ class Ray:
         In unit-ball coordinates y = L(v) v / |v| every set is the unit ball, whatever the state and the units:
         entropies measured there mean the same everywhere. dy = dv / r^d, so the interior's log-density gains d log r.
         """
-        gauge = with_gradient(self.offset, self.gauge, self.gradient)
+        gauge = self._differentiable_gauge()
         square = self.offset.square().sum(-1)
         away = square > 0.0
         return torch.where(away, square, 1.0).log() / 2.0 - torch.where(away, gauge, 1.0).log()
@@ -176,6 +201,12 @@ class Ray:
         """The action (..., d) in float64 with all leading dimensions: the offset that the gauge map scales."""
         return self.action.double().expand_as(self.offset)
 
+    def _traced_stretch(self, unit: Tensor) -> Tensor:
+        """phi (...) of the gauge map at `unit`, as a function of all that is differentiated by; 1 at 0."""
+        gauge = (self._gauge_of(unit)[1] * unit).sum(-1)
+        at_center = (unit == 0.0).all(-1)
+        return torch.where(at_center, 1.0, _largest(unit) / torch.where(at_center, 1.0, gauge))
+
     @cached_property
     def _stretch(self) -> _Stretch:
         with torch.no_grad():
@@ -187,6 +218,32 @@ class Ray:
             factor = torch.where(size == 0.0, 1.0, gauge).reciprocal()
             face = box_gauge_gradient(direction, None)
             return _Stretch(size, direction, face, factor, face - factor.unsqueeze(-1) * gradient)
+
+
+def _unit(offset: Tensor, near: float = 0.0) -> Tensor:
+    """The offset u (..., d), divided by max_i |u_i|; 0 at 0.
+
+    Its derivative is that of a division by a fixed number. It grows no more where max_i |u_i| is below `near`.
+    """
+    size = offset.detach().abs().amax(-1, keepdim=True)
+    unit = offset.detach() / one_where_zero(size)
+    slope = one_where_zero(size.clamp(min=near)).reciprocal()
+    return unit + slope * (offset - offset.detach())
+
+
+def _largest(unit: Tensor) -> Tensor:
+    """max_i |u_i| (...), with a gradient along the first such coordinate; 1 at 0."""
+    value = (box_gauge_gradient(unit, None) * unit).sum(-1)
+    return torch.where((unit == 0.0).all(-1), 1.0, value)
+
+
+def _tanh_ratio(gauge: Tensor) -> Tensor:
+    """tanh(L) / L (...) for plain autograd: by its series near 0, where a difference in the quotient's would cancel."""
+    small = gauge < 0.01
+    square = torch.where(small, gauge, 0.0).square()
+    series = 1.0 + square * (-1.0 / 3.0 + square * (2.0 / 15.0 - 17.0 / 315.0 * square))
+    away = torch.where(small, 1.0, gauge)
+    return torch.where(small, series, away.tanh() / away)
 
 
 class _Stretch(NamedTuple):

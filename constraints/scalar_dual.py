@@ -111,7 +111,7 @@ class BoxSolution(NamedTuple):
 
 
 def minimize_under_ellipse(
-    problem: RowProblem | BoxProblem, shift: float, scale: Tensor, bound: float
+    problem: RowProblem | BoxProblem, shift: float, scale: Tensor, bound: Tensor | float
 ) -> tuple[Tensor, RowSolution | BoxSolution, Tensor]:
     """Minimiser of sum(shift a^2 / 2 - target a) over the problem's set and sum(scale a^2) <= bound.
 

@@ -9,25 +9,44 @@ from __future__ import annotations
 import functools
 import itertools
 from abc import abstractmethod
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from constraints.base import Coefficients, Constraint, ExplicitSet
-from constraints.errors import check_bound
+from constraints.base import AT_FACE, Constraint, ExplicitSet
+from constraints.coefficients import Bound, BoundCoefficient, Coefficient, Coefficients, flat
+from constraints.errors import ConstraintError
+from constraints.implicit import Boundary
 from constraints.jacobian import JacobianProduct, deflated_jacobian
-from constraints.numerics import one_where_zero, safe_sqrt
+from constraints.numerics import one_where_zero, root_or_one, safe_sqrt
 from constraints.scalar_dual import RowProblem
+
+_TINY = 1e-300  # a divisor in the place of 0
+_MOST_WRITTEN = 16  # coordinates of a set whose 2^d rows are written out
+_MOST_COMPARED = 12  # the same where all rows are compared with each other at every action
+
+
+class Weights(NamedTuple):
+    """Coefficients of a set whose rows are patterns of one weight vector."""
+
+    weight: Tensor  # (..., d)
+    bound: Tensor | float  # (..., 1), of each row
 
 
 class _WeightPatterns(Constraint):
-    """Rows pattern_k * weight(obs), all with the same bound > 0. ValueError for another bound."""
+    """Rows pattern_k * weight(obs), all with the same bound > 0, a number or a function. ValueError for another.
 
-    def __init__(self, weight: Coefficients, bound: float, dim: int):
+    `penalty` and `explicit` write out all rows; ConstraintError with more than 16 coordinates and 2^d of them.
+    """
+
+    def __init__(self, weight: Coefficients, bound: Bound, dim: int):
         super().__init__(dim)
-        check_bound(bound)
-        self.weight = weight
-        self.bound = bound
+        self.weight, self.bound = weight, bound
+        self._weight_at, self._bound_at = Coefficient("weight", weight, (dim,)), BoundCoefficient("bound", bound)
+
+    def _at(self, obs: Tensor) -> Weights:
+        return Weights(self._weight_at(obs), self._bound_at(obs))
 
     @abstractmethod
     def _row_patterns(self, device: torch.device) -> Tensor:
@@ -38,62 +57,71 @@ class _WeightPatterns(Constraint):
         """The row (..., d) with the largest value in the orthant of `side` (..., d)."""
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
-        rows = self.weight(obs).unsqueeze(-2) * self._row_patterns(obs.device)
-        return ExplicitSet(rows, torch.full_like(rows[..., 0], self.bound), [])
+        weight, bound = self._at(obs)
+        rows = weight.unsqueeze(-2) * self._row_patterns(obs.device)
+        return ExplicitSet(rows, torch.ones_like(rows[..., 0]) * bound, [])
 
-    def _excess(self, obs: Tensor, action: Tensor) -> Tensor:
+    def _excess(self, at: Weights, action: Tensor) -> Tensor:
         """Ax - b (..., m) with unit rows; a zero row stays as it is."""
-        weight = self.weight(obs)
+        weight, bound = at
         patterns = self._row_patterns(action.device)
-        norm = (weight**2 @ (patterns**2).T).sqrt()
-        return ((weight * action) @ patterns.T - self.bound) / one_where_zero(norm)
+        norm = root_or_one(weight**2 @ (patterns**2).T)
+        return ((weight * action) @ patterns.T - bound) / norm
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
+    def _violation(self, at: Weights, action: Tensor) -> Tensor:
         # The largest of `_excess`, by sums: matrix products round a sample by the size of its batch, and an
         # environment's check must not depend on the others in its batch.
-        weight = self.weight(obs)
+        weight, bound = at
         patterns = self._row_patterns(action.device)
-        norm = (weight.square().unsqueeze(-2) * patterns.abs()).sum(-1).sqrt()
+        norm = root_or_one((weight.square().unsqueeze(-2) * patterns.abs()).sum(-1))
         value = ((weight * action).unsqueeze(-2) * patterns).sum(-1)
-        return ((value - self.bound) / one_where_zero(norm)).amax(-1)
+        return ((value - bound) / norm).amax(-1)
 
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        return safe_sqrt(self._excess(obs, action).clamp(min=0.0).square().sum(-1))
+    def _penalty(self, at: Weights, action: Tensor) -> Tensor:
+        return safe_sqrt(self._excess(at, action).clamp(min=0.0).square().sum(-1))
 
-    def row_problem(self, obs: Tensor, target: Tensor) -> RowProblem:
+    def row_problem(self, at: Weights, target: Tensor) -> RowProblem:
         """The problem of the one row that can hold the projection of `target`, or the oracle's answer for it.
 
         It is mirrored to the orthant of the target, because the solution never has the opposite sign.
         """
-        return RowProblem(target.abs(), self._row(self.weight(obs), target).abs(), self.bound)
+        return RowProblem(target.abs(), self._row(at.weight, target).abs(), at.bound)
 
-    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        solution = self.row_problem(obs, action).solve()
+    def _project(self, at: Weights, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        solution = self.row_problem(at, action).solve()
 
         def product(vector: Tensor) -> Tensor:
             return deflated_jacobian(solution.moves(), torch.copysign(solution.row(), action))(vector)
 
         return torch.copysign(solution.point, action), product
 
-    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        return torch.copysign(self.row_problem(obs, gradient).solve(0.0).point, gradient)
+    def _boundaries(self, at: Weights, point: Tensor) -> list[Boundary]:
+        row = self._row(at.weight, point.detach()) / at.bound
+        return [Boundary((row * point).sum(-1) - 1.0, row)]
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        weight, direction = self.weight(obs), direction.detach()
+    def _free(self, point: Tensor) -> Tensor:
+        # At 0 the row has a kink, which holds a coordinate that it presses there.
+        return (point.abs() < AT_FACE) & (point != 0.0)
+
+    def _linear_oracle(self, at: Weights, gradient: Tensor) -> Tensor:
+        return torch.copysign(self.row_problem(at, gradient).solve(0.0).point, gradient)
+
+    def _gauge_gradients(self, at: Weights, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        (weight, bound), direction = at, direction.detach()
         if center is None:
-            return [self._row(weight, direction.sign()) / self.bound]
+            return [self._row(weight, direction.sign()) / bound]
         # Along center + t direction the largest row value is convex and starts below the bound; its row changes only
         # where a coordinate crosses 0. The row that reaches the bound is the one after the last crossing below it.
         turns = center * direction < 0.0
         crossing = torch.where(turns, -center / direction, 0.0).clamp(max=1e300)
         point = torch.addcmul(center.unsqueeze(-2), crossing.unsqueeze(-1), direction.unsqueeze(-2))
         # A coordinate that crosses is 0. Its rounding, times a large weight, would exceed the bound.
-        point.masked_fill_(crossing.unsqueeze(-2) == crossing.unsqueeze(-1), 0.0)
+        point = point.masked_fill(crossing.unsqueeze(-2) == crossing.unsqueeze(-1), 0.0)
         value = (self._row(weight.unsqueeze(-2), point) * point).sum(-1)
-        last = ((value <= self.bound) * crossing).amax(-1, keepdim=True)
+        last = ((value <= bound) * crossing).amax(-1, keepdim=True)
         before = torch.where(center == 0.0, direction, center)
         row = self._row(weight, torch.where(turns & (crossing <= last), direction, before).sign())
-        return [row / (self.bound - (row * center).sum(-1, keepdim=True))]
+        return [row / (bound - (row * center).sum(-1, keepdim=True))]
 
 
 class WeightedL1(_WeightPatterns):
@@ -105,14 +133,17 @@ class WeightedL1(_WeightPatterns):
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
         return weight.abs() * side.sign()
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        weight = self.weight(obs)
-        norm = weight.norm(dim=-1)  # of every row
-        return ((weight * action).abs().sum(-1) - self.bound) / one_where_zero(norm)
+    def _violation(self, at: Weights, action: Tensor) -> Tensor:
+        norm = at.weight.norm(dim=-1)  # of every row
+        return ((at.weight * action).abs().sum(-1) - flat(at.bound)) / one_where_zero(norm)
 
 
 class WeightedPositivePart(_WeightPatterns):
-    """sum max(w_i a_i, 0) <= bound in the box: 2^d - 1 rows (R+M, H+M, W+M)."""
+    """sum max(w_i a_i, 0) <= bound in the box: 2^d - 1 rows (R+M, H+M, W+M).
+
+    With more than 12 coordinates, `violation` of an action inside the set is that of the nearest of d rows, and not of
+    all: it may be lower, and it is negative all the same. Outside it is exact.
+    """
 
     origin_centered = False
 
@@ -122,15 +153,29 @@ class WeightedPositivePart(_WeightPatterns):
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
         return weight * (weight * side > 0.0)
 
-    def _center(self, obs: Tensor) -> Tensor:
+    def _violation(self, at: Weights, action: Tensor) -> Tensor:
+        if self.dim <= _MOST_COMPARED:
+            return super()._violation(at, action)
+        # For a point outside the set, the row that it exceeds most is a prefix of the coordinates sorted by a_i / w_i:
+        # where s.w.a > bound, (s.w.a - bound) / |s w| is quasi-convex in the row's s.w.a and |s w|^2, and prefixes are
+        # the corners of what these two can be. For a point inside, the nearest row is a subset-sum problem.
+        weight, bound = at
+        ratio = torch.where(weight == 0.0, -torch.inf, action / weight)
+        order = ratio.argsort(-1, descending=True)
+        weight, action = torch.broadcast_tensors(weight, action)
+        weight, action = weight.gather(-1, order), action.gather(-1, order)
+        norm = root_or_one(weight.square().cumsum(-1))
+        return (((weight * action).cumsum(-1) - bound) / norm).amax(-1)
+
+    def _center(self, at: Weights) -> Tensor:
         # Among the rows of all subsets, only prefixes of the weights sorted downwards limit the radius. Many points
         # attain it; this one is continuous in obs.
-        weight = self.weight(obs)
+        weight, bound = at
         ordered = weight.abs().sort(-1, descending=True).values
-        total, norm = ordered.cumsum(-1), ordered.square().cumsum(-1).sqrt()
-        radius = ((self.bound + total) / (norm + total)).amin(-1, keepdim=True).clamp(max=1.0)
+        total, norm = ordered.cumsum(-1), safe_sqrt(ordered.square().cumsum(-1))
+        radius = ((bound + total) / (norm + total).clamp(min=_TINY)).amin(-1, keepdim=True).clamp(max=1.0)
         room = 1.0 - radius
-        return -(radius**2 * weight / (2.0 * self.bound)).clamp(-room, room)
+        return -(radius**2 * weight / (2.0 * bound)).clamp(-room, room)
 
 
 class HalfSpace(_WeightPatterns):
@@ -138,7 +183,7 @@ class HalfSpace(_WeightPatterns):
 
     origin_centered = False
 
-    def __init__(self, normal: Coefficients, bound: float, dim: int):
+    def __init__(self, normal: Coefficients, bound: Bound, dim: int):
         super().__init__(normal, bound, dim)
 
     def _row_patterns(self, device: torch.device) -> Tensor:
@@ -147,16 +192,15 @@ class HalfSpace(_WeightPatterns):
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
         return weight
 
-    def _mirrored(self, obs: Tensor, target: Tensor, metric: float) -> tuple[RowProblem, Tensor]:
+    def _mirrored(self, at: Weights, target: Tensor, metric: float) -> tuple[RowProblem, Tensor]:
         """The problem in coordinates 1 + a sign(w), which run from 0 to 2, and the signs (..., d)."""
-        weight = self.weight(obs)
-        size = weight.abs()
+        weight, size = at.weight, at.weight.abs()
         sign = torch.copysign(torch.ones_like(weight), weight)
-        bound = size.sum(-1, keepdim=True) + self.bound
+        bound = size.sum(-1, keepdim=True) + at.bound
         return RowProblem(sign * target + metric, size, bound, top=2.0), sign
 
-    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        problem, sign = self._mirrored(obs, action, 1.0)
+    def _project(self, at: Weights, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        problem, sign = self._mirrored(at, action, 1.0)
         solution = problem.solve()
 
         def product(vector: Tensor) -> Tensor:
@@ -164,24 +208,38 @@ class HalfSpace(_WeightPatterns):
 
         return sign * (solution.point - 1.0), product
 
-    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        problem, sign = self._mirrored(obs, gradient, 0.0)
+    def _free(self, point: Tensor) -> Tensor:
+        return point.abs() < AT_FACE
+
+    def _linear_oracle(self, at: Weights, gradient: Tensor) -> Tensor:
+        problem, sign = self._mirrored(at, gradient, 0.0)
         return sign * (problem.solve(0.0).point - 1.0)
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        weight = self.weight(obs)
-        slack = self.bound if center is None else self.bound - (weight * center).sum(-1, keepdim=True)
+    def _gauge_gradients(self, at: Weights, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        weight, bound = at
+        slack = bound if center is None else bound - (weight * center).sum(-1, keepdim=True)
         return [weight / slack]
 
-    def _center(self, obs: Tensor) -> Tensor:
-        weight = self.weight(obs)
+    def _center(self, at: Weights) -> Tensor:
+        weight, bound = at
         total, norm = weight.abs().sum(-1, keepdim=True), weight.norm(dim=-1, keepdim=True)
-        radius = ((self.bound + total) / (norm + total)).clamp(max=1.0)
+        radius = ((bound + total) / (norm + total).clamp(min=_TINY)).clamp(max=1.0)
         return -(1.0 - radius) * weight.sign()
 
 
-@functools.lru_cache
 def _all_patterns(entries: tuple[float, float], dim: int, device: torch.device) -> Tensor:
-    """Every pattern (2^dim, dim) of the two entries."""
-    rows = list(itertools.product(entries, repeat=dim))
-    return torch.tensor(rows, dtype=torch.float64, device=device)
+    """Every pattern (2^dim, dim) of the two entries; ConstraintError where they are too many to be written out."""
+    if dim > _MOST_WRITTEN:
+        raise ConstraintError(
+            f"a set of {dim} coordinates has 2^{dim} rows, and penalty and explicit write them out for at most"
+            f" {_MOST_WRITTEN} coordinates; violation(obs, action).clamp(min=0) is a penalty without such a limit"
+        )
+    return _cached_patterns(entries, dim, device)
+
+
+@functools.lru_cache
+def _cached_patterns(entries: tuple[float, float], dim: int, device: torch.device) -> Tensor:
+    # Whatever the mode of the first caller: autograd takes no tensors that were made in inference mode.
+    with torch.inference_mode(False):
+        rows = list(itertools.product(entries, repeat=dim))
+        return torch.tensor(rows, dtype=torch.float64, device=device)

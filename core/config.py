@@ -18,9 +18,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from core.words import ConfigError
 
-THREADS = min(torch.get_num_threads(), 4)
-"""The threads of a cell that is alone on the machine: all physical cores (or OMP_NUM_THREADS), but no more than 4, as
-the networks are small."""
+CORES = torch.get_num_threads()
+"""All physical cores, or OMP_NUM_THREADS."""
+THREADS = {"cpu": min(CORES, 4), "cuda": min(CORES, 8)}
+"""What threads=auto is for a cell that is alone on the machine. Its networks are small and fill no more than 4; beside
+a GPU the threads move MuJoCo's robots."""
+AUTO = "auto"
+"""Stands for the fastest choice on the machine that trains."""
 
 
 QUICK_EPISODES = (1, 2)
@@ -107,12 +111,16 @@ class Config:
         None, "simulator of the robot, where there is a choice (Reacher: closed-form, pybullet)"
     )
     device: str = setting(
-        "cpu",
-        "of networks and replay buffer: cpu, cuda or cuda:1",
+        AUTO,
+        "of networks and replay buffer: auto (a GPU where there is one), cpu, cuda or cuda:1",
         # Only the machine that trains can tell whether there is such a GPU.
-        Rule(lambda value: bool(re.fullmatch(r"cpu|cuda(:[0-9]+)?", value)), "must be cpu, cuda or cuda:N"),
+        Rule(lambda value: bool(re.fullmatch(r"auto|cpu|cuda(:[0-9]+)?", value)), "must be auto, cpu, cuda or cuda:N"),
     )
-    threads: int = setting(THREADS, "CPU threads (default: a cell alone up to 4, in a sweep 1)", AT_LEAST_ONE)
+    threads: int | str = setting(
+        AUTO,
+        "CPU threads; auto: a cell alone up to 4 (beside a GPU 8), in a sweep 1",
+        Rule(lambda value: value == AUTO or (isinstance(value, int) and value >= 1), "must be auto or at least 1"),
+    )
     checkpoint_every: int = setting(10_000, "environment steps of a seed between checkpoints", AT_LEAST_ONE)
 
 

@@ -1,18 +1,17 @@
 """Gradient steps as CUDA graphs: the hundreds of kernels of a step are launched at once, without Python in between.
 
 A graph repeats its operations on the same memory. Only the random numbers differ from step to step. They are drawn on
-the CPU, from each seed's own streams, as without a GPU, and copied to where the graph reads them (`core.random.Tape`).
+the CPU, from each seed's own streams, as without a GPU, many steps at a time (`core.ahead`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import torch
 
 from core.agent import Agent
-from core.random import Tape
+from core.ahead import Ahead, Draw
 from core.replay import Replay
 
 EAGER_STEPS = 3
@@ -20,21 +19,19 @@ EAGER_STEPS = 3
 
 
 class CapturedStep:
-    """A gradient step of `agent`, captured but not taken, that can be repeated. `tape` is from an earlier step."""
+    """A gradient step of `agent`, captured but not taken, that can be repeated."""
 
-    def __init__(self, agent: Agent, step: Callable[[], None], tape: Tape):
-        self.agent, self.tape = agent, tape
+    def __init__(self, agent: Agent, step: Callable[[], None]):
+        self.agent = agent
         self.graph = torch.cuda.CUDAGraph()
         updates, losses = agent.updates, agent.losses
         agent.losses = {}
-        tape.rewind()
         with torch.cuda.graph(self.graph):
             step()
         self.counted, agent.updates = agent.updates - updates, updates
         self.losses, agent.losses = agent.losses, losses  # in the graph's memory: each repetition fills them
 
     def repeat(self) -> None:
-        self.tape.draw_again()
         self.graph.replay()
         self.agent.updates += self.counted
         self.agent.losses |= self.losses
@@ -49,11 +46,13 @@ class GradientSteps:
 
     def __init__(self, agent: Agent, replay: Replay, batch_size: int):
         self.agent, self.replay, self.batch_size = agent, replay, batch_size
+        self.streams = agent.update_noise, replay.streams
         self.eager = [0] * agent.cycle  # steps of each kind
-        self.tapes: dict[int, Tape] = {}
+        self.draws: list[list[list[Draw]]] = [[[]] * agent.cycle for _ in self.streams]  # of each kind of step
         self.captured: dict[int, CapturedStep] = {}
 
     def __call__(self) -> None:
+        self.replay.flush()
         if self.agent.device.type != "cuda" or self.agent.constraint.solved_on_cpu:
             self._step()
             return
@@ -62,30 +61,32 @@ class GradientSteps:
             self._step_aside(kind)
             self.eager[kind] += 1
             return
+        if not self.captured:
+            for streams, draws in zip(self.streams, self.draws, strict=True):
+                streams.ahead = Ahead(streams.generators, draws, streams.device) if any(draws) else None
         if kind not in self.captured:
-            with self._using(self.tapes[kind]):
-                self.captured[kind] = CapturedStep(self.agent, self._step, self.tapes[kind])
+            self.captured[kind] = CapturedStep(self.agent, self._step)
+        for streams in self.streams:
+            if streams.ahead:
+                streams.ahead.begin(kind)
         self.captured[kind].repeat()
 
     def _step(self) -> None:
+        for streams in self.streams:
+            if streams.ahead:
+                streams.ahead.read(self.agent.updates % self.agent.cycle)
         self.agent.update(self.replay.sample(self.batch_size))
 
     def _step_aside(self, kind: int) -> None:
-        """An eager step on a stream of its own, as capturing demands, that records its draws."""
-        self.tapes[kind] = Tape()
+        """An eager step on a stream of its own, as capturing demands. Its draws are noted."""
+        for streams in self.streams:
+            streams.recorded = []
         stream = torch.cuda.Stream(self.agent.device)
         stream.wait_stream(torch.cuda.current_stream(self.agent.device))
-        with torch.cuda.stream(stream), self._using(self.tapes[kind]):
+        with torch.cuda.stream(stream):
             self._step()
         torch.cuda.current_stream(self.agent.device).wait_stream(stream)
-
-    @contextmanager
-    def _using(self, tape: Tape) -> Iterator[None]:
-        streams = (self.agent.update_noise, self.replay.streams)
-        for each in streams:
-            each.tape = tape
-        try:
-            yield
-        finally:
-            for each in streams:
-                each.tape = None
+        for draws, streams in zip(self.draws, self.streams, strict=True):
+            draws[kind], streams.recorded = streams.recorded or [], None
+        if self.agent.updates % self.agent.cycle != (kind + 1) % self.agent.cycle:
+            raise RuntimeError(f"{type(self.agent).__name__}.update must count its steps in `updates`")

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from constraints import ConstraintError
 from core.random import stream_seed
 
 StepTogether = Callable[[Sequence[Any], np.ndarray], Sequence[Any]]
@@ -18,6 +19,11 @@ StepTogether = Callable[[Sequence[Any], np.ndarray], Sequence[Any]]
 action that it refuses, the error that `step` raises."""
 Watch = Callable[[int], AbstractContextManager[Callable[[int], Any]]]
 """A context around an evaluation of at most so many steps; its function counts steps."""
+
+
+def refusal(error: Exception, obs: Any) -> str:
+    """Why an action was refused at the observation (n,), which a ConstraintError does not know."""
+    return f"{error}, at observation {obs.tolist()}" if isinstance(error, ConstraintError) else str(error)
 
 
 class Evaluator:
@@ -79,12 +85,13 @@ class Evaluator:
             outcomes = self.step_together([envs[k] for k in running], actions[running])
             for k, outcome in zip(running, outcomes, strict=True):
                 if isinstance(outcome, Exception):
-                    self.refused[which[k // count]] = str(outcome)
+                    self.refused[which[k // count]] = refusal(outcome, obs[k])
                     returns[k] = np.nan
                     continue
-                obs[k], reward, terminated, truncated, _ = outcome
+                arrived, reward, terminated, truncated, _ = outcome
                 returns[k] += reward
                 if not (terminated or truncated):
+                    obs[k] = arrived  # no action follows the last observation, where the set may be empty
                     still_running.append(k)
             running = still_running
         return returns.reshape(len(which), count)

@@ -58,7 +58,7 @@ class Moments:
             self.agent.load_training_state(i, state["agent"])
             self.evaluator.set_state(i, state["evaluator"])
             self.replay.added[i] = state["added"]
-            self.replay.streams.generators[i].set_state(state["sampling"])
+            self.replay.streams.load_state(i, state["sampling"])
             checkpoint.fill(*self._stored(seed))
         for seed, checkpoint, state in zip(self.seeds, checkpoints, states, strict=True):
             seed.restore(state)
@@ -74,7 +74,7 @@ class Moments:
             "agent": self.agent.training_state(i),
             "evaluator": self.evaluator.get_state(i),
             "added": self.replay.added[i],
-            "sampling": self.replay.streams.generators[i].get_state(),
+            "sampling": self.replay.streams.state(i),
             "seconds": self.timer.seconds,
         }
 

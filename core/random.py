@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from core.ahead import Ahead, Draw
 
 PURPOSES = ("init", "explore", "replay", "update", "environment", "evaluation")
 
@@ -15,34 +17,6 @@ def stream_seed(seed: int, purpose: str, index: int = 0) -> int:
     """The 31-bit seed of one stream: a hash of the run's seed, the purpose and an index within the purpose."""
     sequence = np.random.SeedSequence((seed, PURPOSES.index(purpose), index))
     return int(sequence.generate_state(1)[0] >> 1)
-
-
-class Tape:
-    """The draws of one gradient step in their order, each with the tensor on the device that holds its numbers.
-
-    It records first. After `rewind` it returns the same tensors again, in the same order, and draws nothing.
-    """
-
-    def __init__(self) -> None:
-        self.entries: list[tuple[Callable[[], Tensor], Tensor]] = []
-        self.position: int | None = None
-
-    def deliver(self, draw: Callable[[], Tensor], device: torch.device) -> Tensor:
-        """The numbers of `draw()` on the `device`."""
-        if self.position is None:
-            self.entries.append((draw, draw().to(device)))
-            return self.entries[-1][1]
-        self.position += 1
-        return self.entries[self.position - 1][1]
-
-    def rewind(self) -> None:
-        self.position = 0
-
-    def draw_again(self) -> None:
-        """Put new numbers from the streams into the same tensors, without waiting for the device."""
-        for draw, numbers in self.entries:
-            drawn = draw()
-            numbers.copy_(drawn.pin_memory() if numbers.is_cuda else drawn, non_blocking=True)
 
 
 class Streams:
@@ -54,31 +28,55 @@ class Streams:
 
     def __init__(self, seeds: Sequence[int], purpose: str, device: torch.device | str = "cpu"):
         self.device = torch.device(device)
-        self.tape: Tape | None = None  # of the gradient step that is recorded or captured
         self.generators = [torch.Generator().manual_seed(stream_seed(seed, purpose)) for seed in seeds]
+        self.recorded: list[Draw] | None = None  # the draws since it was set to an empty list
+        self.ahead: Ahead | None = None  # has drawn the numbers of coming gradient steps, where these are captured
 
     def normal(self, *shape: int, which: Iterable[int] | None = None) -> Tensor:
         """Standard normal numbers (seeds, *shape). Rows outside `which` are zero and their streams stay untouched."""
-        return self.deliver(lambda: self._fill(shape, which, lambda row, generator: row.normal_(generator=generator)))
+        return self._numbers(Draw("normal", shape), which)
 
     def uniform(self, *shape: int, which: Iterable[int] | None = None) -> Tensor:
         """Uniform numbers in [-1, 1), otherwise as `normal`."""
-        return self.deliver(
-            lambda: self._fill(shape, which, lambda row, generator: row.uniform_(-1.0, 1.0, generator=generator))
-        )
+        return self._numbers(Draw("uniform", shape), which)
 
-    def indices(self, sizes: Sequence[int], count: int) -> Tensor:
-        """(seeds, count) integers on the CPU, row i uniform in [0, sizes[i])."""
-        draws = [torch.randint(n, (count,), generator=g) for n, g in zip(sizes, self.generators, strict=True)]
-        return torch.stack(draws)
+    def indices(self, sizes: Sequence[int], count: int, sizes_there: Tensor | None = None) -> Tensor:
+        """(seeds, count) integers on the device, row i uniform in [0, sizes[i]).
 
-    def deliver(self, draw: Callable[[], Tensor]) -> Tensor:
-        """The numbers that `draw` makes, on the device."""
-        return self.tape.deliver(draw, self.device) if self.tape else draw().to(self.device)
+        `sizes_there` (seeds, 1) has the sizes on the device, for steps that are captured.
+        """
+        draw = Draw("words", (count,))
+        if self.ahead:
+            return self.ahead.take(draw) % sizes_there  # as `randint` makes a number of a word
+        self._record(draw)
+        draws = [torch.randint(n, draw.shape, generator=g) for n, g in zip(sizes, self.generators, strict=True)]
+        return torch.stack(draws).to(self.device)
 
-    def _fill(self, shape: tuple[int, ...], which: Iterable[int] | None, draw) -> Tensor:
+    def state(self, i: int) -> Tensor:
+        """The state of the generator of the seed in position i. Numbers drawn ahead are not drawn yet."""
+        return self.ahead.state(i) if self.ahead else self.generators[i].get_state()
+
+    def load_state(self, i: int, state: Tensor) -> None:
+        """Put what `state` returned back into position i."""
+        if self.ahead:
+            self.ahead.rewind()
+            self.ahead.start[i] = state
+        self.generators[i].set_state(state)
+
+    def _record(self, draw: Draw) -> None:
+        if self.recorded is not None:
+            self.recorded.append(draw)
+
+    def _numbers(self, draw: Draw, which: Iterable[int] | None) -> Tensor:
+        if self.ahead or self.recorded is not None:
+            if which is not None:
+                raise ValueError("a gradient step draws for all seeds: `which` is for exploration")
+            if self.ahead:
+                return self.ahead.take(draw)
+            self._record(draw)
         everyone = which is None
-        out = (torch.empty if everyone else torch.zeros)(len(self.generators), *shape)
-        for i in range(len(self.generators)) if everyone else which:
-            draw(out[i], self.generators[i])
-        return out
+        out = (torch.empty if everyone else torch.zeros)(len(self.generators), *draw.shape)
+        rows = out.unbind()
+        for i in range(len(rows)) if everyone else which:
+            draw.fill(rows[i], self.generators[i])
+        return out.to(self.device)

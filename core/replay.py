@@ -10,6 +10,9 @@ from torch import Tensor
 
 from core.random import Streams
 
+MOST_WAITING = 1000
+"""Environment steps whose transitions go into the buffer at once, at most."""
+
 
 class Batch(NamedTuple):
     """Transitions (seeds, batch, features). The replay buffer has the columns in the same order.
@@ -45,19 +48,49 @@ class Replay:
         widths = {"obs": obs_dim, "action": action_dim, "reward": 1, "terminated": 1, "next_obs": obs_dim}
         widths |= {"center": center_dim, "next_center": center_dim}
         self.widths = [widths[column] for column in Batch._fields if widths[column]]
-        self.rows = torch.empty(len(seeds) * capacity, sum(self.widths), device=device)
+        self.device = torch.device(device)
+        self._rows = torch.empty(len(seeds) * capacity, sum(self.widths), device=device)
         self.offsets = torch.arange(len(seeds), device=device).unsqueeze(1) * capacity
-        self.rows[self.offsets] = 0.0  # a seed that fails at its first step has no transitions and samples this row
+        self._rows[self.offsets] = 0.0  # a seed that fails at its first step has no transitions and samples this row
+        self.everyone = [*range(len(seeds))]
         self.added = [0] * len(seeds)
+        # Transitions that each seed can sample, after `sizes_of` were added.
+        self.sizes, self.sizes_of = torch.ones(len(seeds), 1, dtype=torch.int64, device=device), [0] * len(seeds)
+        # Transitions on their way: they go into the buffer, and to the device, in one piece before it is read.
+        self.waiting: list[Tensor] = []
+        self.places: list[int] = []
+        self.most_waiting = min(capacity, MOST_WAITING)  # no place twice
         self.streams = Streams(seeds, "replay", device)
+
+    @property
+    def rows(self) -> Tensor:
+        """All transitions (seeds * capacity, features)."""
+        self.flush()
+        return self._rows
 
     def add(self, which: Sequence[int], transitions: Batch) -> None:
         """Append one transition to each seed of `which`. All columns are (seeds, features), with one reward each."""
-        places = [i * self.capacity + self.added[i] % self.capacity for i in which]
-        rows = torch.cat([column for column in transitions if column is not None], dim=-1)[list(which)]
-        self.rows.index_copy_(0, torch.tensor(places).to(self.rows.device), rows.to(self.rows.device))
+        which = list(which)
+        rows = torch.cat([column for column in transitions if column is not None], dim=-1)
+        self.waiting.append(rows if which == self.everyone else rows[which])
         for i in which:
+            self.places.append(i * self.capacity + self.added[i] % self.capacity)
             self.added[i] += 1
+        if len(self.waiting) == self.most_waiting:
+            self._put()
+
+    def flush(self) -> None:
+        """Put the transitions that wait into the buffer, without waiting for the device."""
+        if self.waiting:
+            self._put()
+        if self.sizes_of != self.added:
+            self.sizes.copy_(self._there(torch.tensor(self._sizes()).unsqueeze(1)), non_blocking=True)
+            self.sizes_of = list(self.added)
+
+    def _put(self) -> None:
+        places, rows = self._there(torch.tensor(self.places)), self._there(torch.cat(self.waiting))
+        self._rows.index_copy_(0, places, rows)
+        self.waiting, self.places = [], []
 
     def stretch(self, i: int, start: int, stop: int) -> list[Tensor]:
         """Views of the rows of transitions `start` to `stop` - 1 of the seed in position i, counted from its first
@@ -70,7 +103,7 @@ class Replay:
 
     def sample(self, batch_size: int) -> Batch:
         """`batch_size` transitions of every seed, uniform with replacement."""
-        indices = self.streams.deliver(lambda: self.streams.indices(self._sizes(), batch_size)) + self.offsets
+        indices = self.streams.indices(self._sizes(), batch_size, self.sizes) + self.offsets
         rows = self.rows.index_select(0, indices.flatten()).view(*indices.shape, -1)
         obs, action, reward, terminated, next_obs, *centers = rows.split(self.widths, dim=-1)
         return Batch(obs, action, reward[..., 0], terminated[..., 0], next_obs, *(centers or (None, None)))
@@ -78,3 +111,7 @@ class Replay:
     def _sizes(self) -> list[int]:
         """Transitions that each seed can sample."""
         return [min(max(n, 1), self.capacity) for n in self.added]
+
+    def _there(self, tensor: Tensor) -> Tensor:
+        """A tensor from the CPU on the device."""
+        return tensor.pin_memory().to(self.device, non_blocking=True) if self.device.type == "cuda" else tensor

@@ -50,6 +50,12 @@ class Seed:
     def ended(self) -> bool:
         return self.result is not None or self.failure is not None
 
+    @property
+    def result_due(self) -> bool:
+        """Whether it has diverged, and the best parameters before that have not had their final evaluation yet."""
+        has_best = self.best is not None and math.isfinite(self.best.mean)
+        return self.failure is not None and "result" not in self.failure and has_best
+
     def count_step(self, config: Config, episode_over: bool) -> bool:
         """Count an environment step. Return True if a rollout ends here and no gradient steps follow it."""
         self.steps += 1

@@ -67,7 +67,7 @@ class Snapshots(ABC):
             "parameters": self.state(i),
             "optimizers": optimizers,
             "memory": {name: _copy(tensor[i]) for name, tensor in self.memory().items()},
-            "streams": {name: streams.generators[i].get_state() for name, streams in self.streams().items()},
+            "streams": {name: streams.state(i) for name, streams in self.streams().items()},
             "updates": self.updates,
         }
 
@@ -86,7 +86,7 @@ class Snapshots(ABC):
         for name, tensor in self.memory().items():
             tensor[i] = state["memory"][name]
         for name, streams in self.streams().items():
-            streams.generators[i].set_state(state["streams"][name])
+            streams.load_state(i, state["streams"][name])
         self.updates = state["updates"]
 
     @torch.no_grad()

@@ -14,10 +14,12 @@ import gymnasium
 import numpy as np
 import torch
 
+from constraints import ConstraintError
 from core.agent import Agent
 from core.config import Config
 from core.cuda_graph import GradientSteps
-from core.evaluation import Evaluator, StepTogether
+from core.evaluation import Evaluator, StepTogether, refusal
+from core.guard import Guard, step_apart
 from core.moments import Moments
 from core.progress import PhaseTimer, Progress
 from core.random import stream_seed
@@ -47,10 +49,12 @@ class Trainer:
         stop_if_asked: Callable[[], None] = lambda: None,
     ):
         self.config, self.agent = config, agent
-        self.step_together, self.stop_if_asked = step_together, stop_if_asked
+        self.guard = Guard(agent.constraint, len(agent.seeds))
+        agent.constraint = self.guard.constraint
+        self.step_together, self.stop_if_asked = step_apart(step_together), stop_if_asked
         rows = zip(agent.seeds, envs, writers, strict=True)
         self.seeds = [Seed(number, i, env, writer) for i, (number, env, writer) in enumerate(rows)]
-        self.evaluator = Evaluator(make_env, agent.seeds, config.eval_episodes, step_together, stop_if_asked)
+        self.evaluator = Evaluator(make_env, agent.seeds, config.eval_episodes, self.step_together, stop_if_asked)
         self.replay = Replay(
             agent.seeds,
             min(config.buffer_size, config.steps),
@@ -71,21 +75,25 @@ class Trainer:
     def run(self) -> list[dict | None]:
         """Train every seed to the end. Returns their results, one dict a seed, None for a seed that diverged.
 
-        After an Interrupted everything is in a checkpoint. Any early end saves the last parameters.
+        After an Interrupted everything is in a checkpoint. Any early end saves the last parameters. An error that
+        belongs to one seed ends that seed alone (`failed.json` says where); any other one is raised, after a line
+        on stderr that names algorithm, task and step.
         """
         self.progress = Progress(self.config, [seed.steps for seed in self.seeds], self.show_progress)
         self.evaluator.watch = self.progress.evaluation
         try:
             if not self.began:
-                self._begin()
+                self._sparing(self._begin)
             while live := self._live():
                 self.stop_if_asked()
                 if self._all_steps() - self.steps_at_checkpoint >= self.config.checkpoint_every * len(live):
                     self._checkpoint()
-                self._advance(live)
+                self._sparing(self._advance, live)
         except BaseException as error:
             if isinstance(error, Interrupted):
                 self._checkpoint()
+            elif isinstance(error, Exception):
+                self._report(error)
             self._save_last()
             raise
         finally:
@@ -97,9 +105,41 @@ class Trainer:
             seed.checkpoints.remove()
         return [seed.result for seed in self.seeds]
 
+    def _sparing(self, part: Callable[..., None], *arguments: Any) -> None:
+        """Call `part`. A seed ends if the constraint breaks down at one of its observations, and the others go on."""
+        try:
+            part(*arguments)
+        except ConstraintError:
+            self._fail_refused()
+            if not all(seed.ended for seed in self.seeds):  # it is about no single seed
+                raise
+        self._fail_refused()
+
+    def _fail_refused(self) -> None:
+        for i, reason in self.guard.refused.items():
+            if not self.seeds[i].ended:
+                self._fail(self.seeds[i], self._of_constraint(reason))
+
+    def _of_constraint(self, reason: str) -> str:
+        return f"the constraint of {self.config.env}: {reason}"
+
+    def _report(self, error: Exception) -> None:
+        """Say where an error came that ends all seeds, and what is left of the training.
+
+        There is no new checkpoint: training could not go on exactly from the middle of a step.
+        """
+        rest = "no checkpoint yet"
+        if self.steps_at_checkpoint:
+            rest = f"the same command resumes from step {self.steps_at_checkpoint // len(self.seeds)}"
+        step = max(seed.steps for seed in self.seeds)
+        where = f"{self.config.algo} on {self.config.env}, seeds {', '.join(map(str, self.agent.seeds))}, step {step}"
+        print(f"{where}: {type(error).__name__} ({rest})", file=sys.stderr)
+
     def _live(self) -> list[Seed]:
         """The seeds that have not ended. The folders of the others tell from here on how they did."""
-        if any(seed.ended and not seed.recorded for seed in self.seeds):
+        if ended := [seed for seed in self.seeds if seed.ended and not seed.recorded]:
+            if due := [seed for seed in ended if seed.result_due]:
+                self._evaluate_failed(due)
             self._record_ends()
         return [seed for seed in self.seeds if not seed.ended]
 
@@ -111,6 +151,7 @@ class Trainer:
         for seed in self.seeds:
             self.obs[seed.position] = _tensor(seed.env.reset(seed=stream_seed(seed.number, "environment"))[0])
         self.center = self.agent.centers(self.obs)
+        self.agent.start_episode(range(len(self.seeds)))
         self.agent.start_rollout(range(len(self.seeds)))
 
     def _advance(self, live: Sequence[Seed]) -> None:
@@ -154,11 +195,13 @@ class Trainer:
             warming_up = [seed.position for seed in seeds if seed.steps < starts]
             exploring = [seed.position for seed in seeds if seed.steps >= starts]
             action = self.agent.act(self.obs, self.center, warming_up, exploring)
+            self._fail_refused()
         arrived, reset_obs = self.obs.numpy().copy(), {}
         reward, terminated, ended = (np.zeros((len(self.seeds), 1), dtype=np.float32) for _ in range(3))
         with self.timer.timed("environment"):
             stepped = []
-            for seed, outcome in self._outcomes(seeds, action.suggested.numpy(), action.executed.numpy()):
+            acting = [seed for seed in seeds if not seed.ended]
+            for seed, outcome in self._outcomes(acting, action.suggested.numpy(), action.executed.numpy()):
                 i = seed.position
                 obs, reward[i], terminated[i], truncated, _ = outcome
                 if not (np.isfinite(obs).all() and np.isfinite(reward[i])):
@@ -175,6 +218,10 @@ class Trainer:
         next_obs = _tensor(arrived)
         with self.timer.timed("acting"):
             next_center = self.agent.centers(next_obs)
+            self._fail_refused()
+        stepped = [seed for seed in stepped if not seed.ended]
+        if not stepped:
+            return
         ends = _tensor(terminated)
         transitions = Batch(self.obs, action.stored, _tensor(reward), ends, next_obs, self.center, next_center)
         self.replay.add([seed.position for seed in stepped], transitions)
@@ -183,6 +230,8 @@ class Trainer:
         for i, obs in reset_obs.items():
             self.obs[i] = _tensor(obs)
         self.center = self.agent.centers(self.obs) if reset_obs else next_center
+        if reset_obs:
+            self.agent.start_episode(list(reset_obs))
         self.progress.advance(len(stepped), min(seed.steps for seed in stepped))
         new_rollout = [s.position for s in stepped if s.count_step(self.config, bool(ended[s.position]))]
         if new_rollout:
@@ -201,7 +250,7 @@ class Trainer:
         taken = []
         for seed, outcome in zip(sound, outcomes, strict=True):
             if isinstance(outcome, Exception):
-                self._fail(seed, str(outcome))
+                self._fail(seed, refusal(outcome, self.obs[seed.position]))
             else:
                 taken.append((seed, outcome))
         return taken
@@ -215,8 +264,8 @@ class Trainer:
             return
         which = [seed.position for seed in seeds]
         with self.timer.timed("evaluation"):
-            returns = self.evaluator.run(self._policy(which), which, self.config.eval_episodes)
-        statistics = self.agent.statistics()
+            returns = self._play(self.agent.policy(which), which, self.config.eval_episodes)
+        statistics = self.agent.statistics() if any(seed.gradient_steps for seed in seeds) else {}
         for seed, seed_returns in zip(seeds, returns, strict=True):
             i = seed.position
             if i in self.evaluator.refused:
@@ -233,36 +282,50 @@ class Trainer:
         best = [seed.best.mean for seed in self.seeds if seed.best]
         self.progress.show_evaluation(float(returns.mean()), best)
 
-    def _policy(self, which: Sequence[int]) -> Callable[[torch.Tensor], torch.Tensor]:
-        """The present deterministic policy of the seeds in the positions `which`, from and to the CPU."""
-        policy = self.agent.policy(which)
-        return lambda obs: policy(obs.to(self.agent.device)).cpu()
+    def _play(self, policy: Callable[[torch.Tensor], torch.Tensor], which: Sequence[int], episodes: int) -> np.ndarray:
+        """The returns (len(which), episodes) of `policy`, that of the seeds in the positions `which`."""
+        with self.guard.of(which) as refused:
+            apart = self.guard.apart(lambda obs: policy(obs.to(self.agent.device)).cpu())
+            returns = self.evaluator.run(apart, which, episodes)
+        self.evaluator.refused |= {i: self._of_constraint(reason) for i, reason in refused.items()}
+        return returns
 
     def _finish(self, seeds: Sequence[Seed]) -> None:
         """Evaluate the best parameters of `seeds` at length, for the result."""
+        self.progress.show_final_evaluation()
+        for seed, result in zip(seeds, self._final_results(seeds), strict=True):
+            if isinstance(result, str):
+                self._fail(seed, result)
+                seed.failure["result"] = None  # those parameters are what has just failed
+            else:
+                seed.result = result | self._counts(seed) | {"seeds_in_lockstep": len(self.seeds)}
+
+    def _evaluate_failed(self, seeds: Sequence[Seed]) -> None:
+        """Evaluate the best parameters of `seeds`, which have diverged, for the result in their failures."""
+        for seed, result in zip(seeds, self._final_results(seeds), strict=True):
+            seed.failure |= self._counts(seed) | {"result": result}
+
+    def _final_results(self, seeds: Sequence[Seed]) -> list[dict[str, Any] | str]:
+        """The final evaluation of the best parameters of each of `seeds`; the reason where it was refused."""
         which = [seed.position for seed in seeds]
         last = {i: self.agent.state(i) for i in which}
         try:
             for seed in seeds:
                 self.agent.load_state(seed.position, seed.best.parameters)
-            policy = self._policy(which)  # a copy of the best parameters
+            policy = self.agent.policy(which)  # a copy of the best parameters
         finally:
             for i in which:
                 self.agent.load_state(i, last[i])
-        self.progress.show_final_evaluation()
         with self.timer.timed("evaluation"):
-            returns = self.evaluator.run(policy, which, self.config.final_episodes)
+            returns = self._play(policy, which, self.config.final_episodes)
+        results: list[dict[str, Any] | str] = []
         for seed, seed_returns in zip(seeds, returns, strict=True):
             if seed.position in self.evaluator.refused:
-                self._fail(seed, f"final evaluation: {self.evaluator.refused[seed.position]}")
-                continue
-            seed.result = {
-                "return_mean": float(seed_returns.mean()),
-                "returns": seed_returns.tolist(),
-                "best_step": seed.best.step,
-                **self._counts(seed),
-                "seeds_in_lockstep": len(self.seeds),
-            }
+                results.append(f"final evaluation: {self.evaluator.refused[seed.position]}")
+            else:
+                mean = float(seed_returns.mean())
+                results.append({"return_mean": mean, "returns": seed_returns.tolist(), "best_step": seed.best.step})
+        return results
 
     def _counts(self, seed: Seed) -> dict[str, Any]:
         envs = [env.unwrapped for env in (seed.env, *self.evaluator.of_seed(seed.position))]

@@ -1,24 +1,36 @@
 """The paper's 13 tasks as Gymnasium environments: `make("W+M")`, or `gymnasium.make("acrl/W-M-v0")`.
 
-Importing this package registers the tasks with Gymnasium. Its identifiers cannot hold a "+", so there it is
-written "-".
+Importing this package registers the tasks with Gymnasium, and so does a new row of `TASKS`. Gymnasium's identifiers
+cannot hold a "+", so there it is written "-".
 """
 
+import copy
+from typing import Any
+
 import gymnasium
+import numpy as np
 
 from constraints import Constraint
+from envs.check import check_robot
 from envs.constrained import TOLERANCE, ActionConstrainedEnv, InfeasibleActionError, find_task, step_together
-from envs.robot import Robot, UnavailableError
-from envs.tasks import TASKS, Task
+from envs.gymnasium_robot import GymnasiumRobot
+from envs.registry import Task, gymnasium_id
+from envs.robot import Robot, RobotError, UnavailableError
+from envs.tasks import TASKS
+from envs.wrapper import Constrained
 
 __all__ = [
     "TASKS",
     "TOLERANCE",
     "ActionConstrainedEnv",
+    "Constrained",
+    "GymnasiumRobot",
     "InfeasibleActionError",
     "Robot",
+    "RobotError",
     "Task",
     "UnavailableError",
+    "check_robot",
     "constraint",
     "make",
     "step_together",
@@ -31,17 +43,24 @@ def make(
     render_mode: str | None = None,
     simulator: str | None = None,
     show_set: bool = False,
+    dtype: Any = np.float64,
 ) -> ActionConstrainedEnv:
     """The environment of `task` (a key of `TASKS`, as "W+M"); see `ActionConstrainedEnv`.
 
     An infeasible action is refused with `InfeasibleActionError`; with `project` it is projected instead, so
     that any agent for Gymnasium trains on it as the paper's DPre does. `simulator="pybullet"` runs Reacher on PyBullet,
     where that is installed. `show_set` draws the feasible set of a two-dimensional action into pictures.
+    `dtype=np.float32` returns observations in that precision; actions are checked at the exact ones all the same.
 
     Raises ValueError for an unknown task, and UnavailableError, a ValueError too, for a simulator that the robot does
     not have or that is not installed.
     """
-    return ActionConstrainedEnv(task, project, render_mode, simulator, show_set)
+    settings: dict[str, Any] = {"project": project, "render_mode": render_mode, "simulator": simulator}
+    settings |= {"show_set": show_set, "dtype": np.dtype(dtype).name}
+    env = ActionConstrainedEnv(task, **settings)
+    env.spec = copy.deepcopy(gymnasium.spec(gymnasium_id(task)))
+    env.spec.kwargs.update(settings)
+    return env
 
 
 def constraint(task: str) -> Constraint:
@@ -49,9 +68,5 @@ def constraint(task: str) -> Constraint:
     return find_task(task).constraint
 
 
-for _name in TASKS:
-    gymnasium.register(
-        f"acrl/{_name.replace('+', '-')}-v0",
-        entry_point="envs.constrained:ActionConstrainedEnv",
-        kwargs={"task": _name},
-    )
+# Any task by its name: gymnasium.make("acrl/Task-v0", task="R+CBF").
+gymnasium.register("acrl/Task-v0", entry_point="envs.constrained:ActionConstrainedEnv")

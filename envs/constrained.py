@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import json
 import math
@@ -14,8 +15,8 @@ import torch
 
 from core.words import known_name
 from envs.drawing import draw_set
+from envs.registry import TASKS, Task
 from envs.robot import Robot, Step, UnavailableError
-from envs.tasks import TASKS, Task
 
 TOLERANCE = 1e-6  # largest violation an executed action may have, in the units of `Constraint.violation`
 
@@ -32,19 +33,19 @@ def find_task(name: str) -> Task:
     return TASKS[known_name("task", name, TASKS)]
 
 
-def make_robot(task: str, simulator: str | None = None) -> Robot:
-    """A new robot of `task` on `simulator`, a key of the robot's `simulators`; None means the first.
+def make_robot(name: str, task: Task, simulator: str | None = None) -> Robot:
+    """A new robot of `task`, called `name`, on `simulator`, a key of the robot's `simulators`; None means the first.
 
     Raises UnavailableError for a simulator that the robot does not have or that is not installed.
     """
-    robot = find_task(task).robot
+    robot = task.robot
     if simulator is None:
         return robot()
     if simulator not in robot.simulators:
         choices = (
             f"choices: {' '.join(robot.simulators)}" if robot.simulators else "its robot has no choice of simulators"
         )
-        raise UnavailableError(f"unknown simulator {simulator!r} for {task} ({choices})")
+        raise UnavailableError(f"unknown simulator {simulator!r} for {name} ({choices})")
     module, _, name = robot.simulators[simulator].partition(":")
     return getattr(importlib.import_module(module), name)()
 
@@ -62,7 +63,10 @@ def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.nda
     """
     if len(set(map(id, envs))) < len(envs) or any(env.constraint is not envs[0].constraint for env in envs):
         raise ValueError("step_together() takes different environments of one constraint")
-    outcomes: list[Any] = [env._well_formed(action) for env, action in zip(envs, actions, strict=True)]
+    if _all_well_formed(envs, actions):
+        outcomes: list[Any] = [*actions]
+    else:
+        outcomes = [env._well_formed(action) for env, action in zip(envs, actions, strict=True)]
     checked = [k for k, outcome in enumerate(outcomes) if not isinstance(outcome, InfeasibleActionError)]
     if not checked:
         return outcomes
@@ -81,18 +85,30 @@ def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.nda
     return outcomes
 
 
+def _all_well_formed(envs: Sequence[ActionConstrainedEnv], actions: Any) -> bool:
+    """Whether each action is well-formed and each environment ready, asked of all at once. It may say no wrongly."""
+    if not envs or not isinstance(actions, np.ndarray) or actions.shape != (len(envs), envs[0].constraint.dim):
+        return False
+    return all(env._obs is not None for env in envs) and bool(np.isfinite(actions).all())
+
+
 class ActionConstrainedEnv(gymnasium.Env):
     """A robot under the action constraint of one of the paper's tasks.
 
-    Observations are float64 (n,), actions (d,) in [-1, 1]. The violation of every action at the current
-    observation is computed in float64 before it is executed, and above 1e-6 the action is refused. With
-    `project`, an action outside the set is replaced by its projection instead, and
-    `info["executed_action"]` holds what was executed (float64, (d,)). The robot's time limit truncates.
-    `simulator` chooses among the robot's simulators. With `show_set`, pictures show the
-    last action of a two-dimensional action space in the set that was feasible for it.
+    Observations (n,) are of `dtype`, float64 or float32, and actions (d,) lie in [-1, 1]. Before an action is
+    executed, its violation is computed in float64 at the robot's own observation, which is float64 for every `dtype`.
+    An action whose violation is above 1e-6 is refused. With `project`, an action outside the set is replaced by its
+    projection instead, and `info["executed_action"]` holds what was executed (float64, (d,)). The robot's time limit
+    truncates. `simulator` chooses among the robot's simulators. With `show_set`, pictures show the last action of a
+    two-dimensional action space in the set that was feasible for it.
+
+    An environment can be copied and pickled, by cloudpickle as well, at any moment; the copy goes on as the original
+    does, in every bit. After the end of an episode, step() raises gymnasium.error.ResetNeeded. After close(), reset(),
+    step() and render() raise gymnasium.error.ClosedEnvironmentError.
 
     Attributes: `constraint`; `largest_violation` (float) over all executed actions since construction, -inf
-    before the first; `executed_actions` (int), their number; `elapsed_steps` (int) of the current episode.
+    before the first; `executed_actions` (int), their number; `elapsed_steps` (int) of the current episode;
+    `max_episode_steps` (int, None for no limit), the robot's or what `gymnasium.make` was given.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -104,23 +120,32 @@ class ActionConstrainedEnv(gymnasium.Env):
         render_mode: str | None = None,
         simulator: str | None = None,
         show_set: bool = False,
+        dtype: Any = np.float64,
     ):
-        self.constraint = find_task(task).constraint
+        self._definition = find_task(task)
+        self.constraint = self._definition.constraint
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r} (choices: None 'rgb_array')")
         if show_set and self.constraint.dim != 2:
             raise ValueError(
                 f"show_set=True needs a two-dimensional action; {task} has {self.constraint.dim} dimensions"
             )
+        self._dtype = np.dtype(dtype)
+        if self._dtype not in (np.float64, np.float32):
+            raise ValueError(f"unknown dtype {dtype!r} of observations (choices: float64 float32)")
         self.task, self.project, self.render_mode, self.show_set = task, project, render_mode, show_set
-        self.robot = make_robot(task, simulator)
+        self._simulator = simulator
+        self.robot = make_robot(task, self._definition, simulator)
+        self.max_episode_steps: int | None = self.robot.max_episode_steps
         self.metadata = {**self.metadata, "render_fps": self.robot.fps}
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.robot.obs_dim,), np.float64)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.robot.obs_dim,), self._dtype)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.robot.action_dim,), np.float32)
         self.largest_violation, self.executed_actions, self.elapsed_steps = -np.inf, 0, 0
-        self._obs: np.ndarray | None = None  # current observation in an array of its own: callers may write into theirs
-        # Of the episode: the state of the random numbers before its reset, and its actions so far. Actions are kept
-        # only where the robot has no state of its own.
+        # A copy of the observation, as callers may write into theirs; None when no step can follow.
+        self._obs: np.ndarray | None = None
+        self._closed = False
+        # Of the last episode: the state of the random numbers before its reset, and its actions so far. Actions are
+        # kept only where the robot has no state of its own.
         self._start: Mapping[str, Any] | None = None
         self._actions: list[np.ndarray] = []
         self._keeps_actions = False
@@ -128,19 +153,20 @@ class ActionConstrainedEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Start an episode; return observation (n,) and info. `seed` as Gymnasium defines it."""
+        self._refuse_closed("reset")
         super().reset(seed=seed)
         self._start, self._actions, self.elapsed_steps = self.np_random.bit_generator.state, [], 0
-        self._shown = None
+        self._obs, self._shown = None, None
         obs = self.robot.reset(self.np_random)
         self._keeps_actions = self.robot.get_state() is None
         self._obs = obs.copy()
-        return obs, {}
+        return obs.astype(self._dtype, copy=False), {}
 
     def step(self, action: np.ndarray) -> Outcome:
         """Execute `action` (d,); return observation, reward, terminated, truncated, info.
 
         Raises InfeasibleActionError for a wrong shape, a value that is not finite or, without `project`, a
-        violation above 1e-6; gymnasium.error.ResetNeeded before the first reset.
+        violation above 1e-6; gymnasium.error.ResetNeeded before the first reset and after the end of an episode.
         """
         (outcome,) = step_together([self], [action])
         if isinstance(outcome, InfeasibleActionError):
@@ -154,15 +180,18 @@ class ActionConstrainedEnv(gymnasium.Env):
         An episode in progress is kept as the robot's own state. For a robot that has none, it is kept as the random
         numbers before its reset and the actions since. Of an episode that is over only the random numbers are left.
         """
-        in_episode = self._start is not None
+        self._refuse_closed("get_state")
+        in_episode = self._obs is not None
         robot = self.robot.get_state() if in_episode else None
-        random_numbers = self.np_random.bit_generator.state if robot is not None else self._start
+        repeats = in_episode and robot is None
+        actions = self._actions if repeats else []
         return {
-            "random_numbers": json.dumps(random_numbers or self.np_random.bit_generator.state),
+            "random_numbers": json.dumps(self._start if repeats else self.np_random.bit_generator.state),
             "in_episode": in_episode,
             "simulator": type(self.robot).__name__,
             "robot": None if robot is None else torch.from_numpy(robot),
-            "actions": torch.from_numpy(np.array(self._actions)) if self._actions else None,
+            "actions": torch.from_numpy(np.array(actions)) if actions else None,
+            "single": torch.tensor([action.dtype == np.float32 for action in actions]) if actions else None,
             "elapsed_steps": self.elapsed_steps,
             "executed_actions": self.executed_actions,
             "largest_violation": self.largest_violation,
@@ -174,27 +203,31 @@ class ActionConstrainedEnv(gymnasium.Env):
         A robot without a state of its own repeats an episode in progress. Raises ValueError for the state of another
         robot or simulator.
         """
+        self._refuse_closed("set_state")
         if state.get("simulator") != type(self.robot).__name__:
             raise ValueError(f"the state of {state.get('simulator')} does not fit {type(self.robot).__name__}")
         self.np_random.bit_generator.state = json.loads(state["random_numbers"])
         self._start, self._actions, self._obs, self._shown = None, [], None, None
         if state["robot"] is not None:
             self._start, self._keeps_actions = self.np_random.bit_generator.state, False
-            self._obs = self.robot.set_state(state["robot"].numpy())
+            self._obs = self.robot.set_state(state["robot"].numpy()).copy()
         elif state["in_episode"]:
-            self.reset()
-            for action in () if state["actions"] is None else state["actions"].numpy():
-                self._obs = self.robot.step(action)[0]
-                self._actions.append(action)
+            self._start, self._keeps_actions = self.np_random.bit_generator.state, True
+            self._actions = [] if state["actions"] is None else list(state["actions"].numpy())
+            if state.get("single") is not None:  # they are in one array of the wider precision
+                precisions = [np.float32 if single else np.float64 for single in state["single"]]
+                self._actions = [a.astype(p) for a, p in zip(self._actions, precisions, strict=True)]
+            self._obs = self._repeat()
         self.elapsed_steps = state["elapsed_steps"]
         self.executed_actions, self.largest_violation = state["executed_actions"], state["largest_violation"]
 
     def render(self) -> np.ndarray | None:
         """Picture (480, 480, 3), uint8, of the current state; None without `render_mode="rgb_array"`."""
+        self._refuse_closed("render")
         if self.render_mode != "rgb_array":
             return None
         picture = self.robot.render()
-        if self.show_set and self._obs is not None:
+        if self.show_set and (self._shown or self._obs is not None):
             obs, action = self._shown or (self._obs, None)
             picture = draw_set(picture, self._boundary(obs), action)
         return picture
@@ -202,7 +235,44 @@ class ActionConstrainedEnv(gymnasium.Env):
     def close(self) -> None:
         """Free simulator and renderer; closing twice is harmless."""
         self.robot.close()
-        self._obs = None
+        self._obs, self._closed = None, True
+
+    def __copy__(self) -> ActionConstrainedEnv:
+        return copy.deepcopy(self)  # two environments never share a simulator or random numbers
+
+    def __getstate__(self) -> dict[str, Any]:
+        for owner in (self, self.action_space, self.observation_space):
+            _ = owner.np_random  # made now where there is none, so that the copy has the same
+        content = {name: value for name, value in vars(self).items() if name not in ("robot", "constraint")}
+        in_simulator = self._start is not None and not self._closed
+        return content | {"robot": self.robot.get_state() if in_simulator else None}
+
+    def __setstate__(self, content: dict[str, Any]) -> None:
+        content = dict(content)
+        robot = content.pop("robot")
+        vars(self).update(content)
+        self.constraint = self._definition.constraint
+        self.robot = make_robot(self.task, self._definition, self._simulator)
+        if self._closed:
+            self.robot.close()
+        elif robot is not None:
+            self.robot.set_state(robot)
+        elif self._start is not None:
+            now = self.np_random.bit_generator.state
+            self._repeat()
+            self.np_random.bit_generator.state = now
+
+    def _repeat(self) -> np.ndarray:
+        """Play the last episode once more from its start and by its actions; return the observation."""
+        self.np_random.bit_generator.state = self._start
+        obs = self.robot.reset(self.np_random)
+        for action in self._actions:
+            obs = self.robot.step(action.copy())[0]
+        return obs.copy()
+
+    def _refuse_closed(self, method: str) -> None:
+        if self._closed:
+            raise gymnasium.error.ClosedEnvironmentError(f"{self.task}: {method}() after close(); make a new one")
 
     def _boundary(self, obs: np.ndarray) -> np.ndarray:
         """Points (k, 2) around the feasible set at `obs`, in order."""
@@ -215,7 +285,9 @@ class ActionConstrainedEnv(gymnasium.Env):
     def _well_formed(self, action: np.ndarray) -> np.ndarray | InfeasibleActionError:
         """`action` as an array (d,) of finite numbers, or the InfeasibleActionError that says why it is none."""
         if self._obs is None:
-            raise gymnasium.error.ResetNeeded(f"{self.task}: call reset() before step()")
+            self._refuse_closed("step")
+            over = "the episode is over; " if self._start is not None else ""
+            raise gymnasium.error.ResetNeeded(f"{self.task}: {over}call reset() before step()")
         action = np.asarray(action)
         if action.shape != self.action_space.shape:
             expected = self.action_space.shape
@@ -234,10 +306,13 @@ class ActionConstrainedEnv(gymnasium.Env):
             obs, exact = torch.from_numpy(self._obs), torch.from_numpy(action.astype(np.float64))
             exact = self.constraint.project(obs, exact)
             action, violation = exact.numpy(), self.constraint.violation(obs, exact).item()
-        if not violation <= TOLERANCE:  # a NaN is refused as well
+        allowed = TOLERANCE
+        if violation > TOLERANCE and self.constraint.on_empty == "least":
+            allowed += self.constraint.least_violation(torch.from_numpy(self._obs)).item()
+        if not violation <= allowed:  # a NaN is refused as well
             return InfeasibleActionError(
                 f"{self._where()}: action {action} violates the constraint by {violation:.3g} "
-                f"(at most {TOLERANCE:g} is allowed)"
+                f"(at most {allowed:g} is allowed)"
             )
         self.largest_violation = max(self.largest_violation, violation)
         return action
@@ -254,10 +329,19 @@ class ActionConstrainedEnv(gymnasium.Env):
             self._actions.append(np.array(action))
         if self.project:
             info["executed_action"] = np.array(action, np.float64)
-        truncated = self.elapsed_steps >= self.robot.max_episode_steps
-        if terminated or truncated:  # only a reset can follow
-            self._start, self._actions = None, []
-        return obs, reward, terminated, truncated, info
+        truncated = self.max_episode_steps is not None and self.elapsed_steps >= self.max_episode_steps
+        if terminated or truncated:
+            self._obs = None
+        return obs.astype(self._dtype, copy=False), reward, terminated, truncated, info
 
     def _where(self) -> str:
         return f"{self.task}, step {self.elapsed_steps + 1} of the episode"
+
+
+class GivenTimeLimit(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
+    """Tells an `ActionConstrainedEnv` the time limit that `gymnasium.make` was given, which may be a longer one."""
+
+    def __init__(self, env: Any):
+        gymnasium.utils.RecordConstructorArgs.__init__(self)
+        gymnasium.Wrapper.__init__(self, env)
+        env.unwrapped.max_episode_steps = env.spec.max_episode_steps

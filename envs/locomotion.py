@@ -7,32 +7,63 @@ import functools
 import importlib
 import os
 import sys
+import weakref
 from abc import abstractmethod
-from typing import Any
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
+import torch
 
-from envs.robot import Robot, Step
+from envs.robot import Robot, SimulatedRobot, Step
+from envs.threads import call_each
+
+
+def import_mujoco() -> Any:
+    """The package mujoco, also where MUJOCO_GL names an OpenGL library that is not installed.
+
+    The package loads that library when it is imported, and fails without it. Only pictures need it.
+    """
+    try:
+        return importlib.import_module("mujoco")
+    except ModuleNotFoundError:
+        raise
+    except Exception:  # each library has errors of its own, an absent one an AttributeError
+        chosen = os.environ.get("MUJOCO_GL")
+        if chosen is None:
+            raise
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        return importlib.import_module("mujoco")
+    finally:
+        os.environ["MUJOCO_GL"] = chosen
+
+
+@contextmanager
+def silent_mujoco() -> Iterator[None]:
+    """Hide warnings: half_cheetah.xml makes MuJoCo print one and leave a MUJOCO_LOG.TXT where the process runs."""
+    mujoco = import_mujoco()
+    warning_handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(warning_handler)
 
 
 @functools.cache
 def _load_model(file: str) -> Any:
     """The MuJoCo model of `file`, which robots share: half a megabyte each would crowd the processor's cache."""
-    import mujoco
-
+    mujoco = import_mujoco()
     # Gymnasium's own path without its `envs.mujoco` package, which would load every MuJoCo task
     assets = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
-    # half_cheetah.xml makes MuJoCo print a deprecation and leave a MUJOCO_LOG.TXT where the process runs
-    warning_handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
+    with silent_mujoco():
         return mujoco.MjModel.from_xml_path(os.path.join(assets, file))
-    finally:
-        mujoco.set_mju_user_warning(warning_handler)
 
 
-class _Locomotion(Robot):
+class _Locomotion(SimulatedRobot):
     """A planar robot that is rewarded for running along x.
 
     Observation (nq - 1 + nv,): joint positions without the root's x, then joint velocities.
@@ -48,15 +79,14 @@ class _Locomotion(Robot):
     fps: int  # 1 / (time step of the model * frame_skip)
 
     def __init__(self) -> None:
-        import mujoco
-
-        self._mujoco = mujoco
+        self._mujoco = mujoco = import_mujoco()
         self.model = _load_model(self.model_file)
         self.data = mujoco.MjData(self.model)
         # views of the simulator's memory
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._dt = self.model.opt.timestep * self.frame_skip
         self._picture: _Picture | None = None
+        self._built()
 
     def reset(self, rng: np.random.Generator) -> np.ndarray:
         """Draw positions and velocities around the model's own from `rng` (numpy Generator); return obs."""
@@ -70,12 +100,36 @@ class _Locomotion(Robot):
 
         The control cost is summed in the action's own precision, as Gymnasium does.
         """
-        x_before = float(self._qpos[0])
+        x_before = self._start(action)
+        self._simulate()
+        return self._end(x_before, np.square(action).sum())
+
+    @classmethod
+    def step_together(cls, robots: Sequence[Robot], actions: Sequence[np.ndarray]) -> list[Step]:
+        """`step` of each, with the same bits. MuJoCo moves the robots in as many threads as PyTorch computes with."""
+        ours = cast("Sequence[_Locomotion]", robots)
+        starts = [robot._start(action) for robot, action in zip(ours, actions, strict=True)]
+        call_each([robot._simulate for robot in ours], torch.get_num_threads())
+        if len({action.dtype for action in actions}) == 1:
+            squares = [*np.square(np.array(actions)).sum(-1)]
+        else:
+            squares = [np.square(action).sum() for action in actions]
+        return [robot._end(*about) for robot, *about in zip(ours, starts, squares, strict=True)]
+
+    def _start(self, action: np.ndarray) -> float:
+        """Apply the action; return x before the step."""
         self._ctrl[:] = action
+        return float(self._qpos[0])
+
+    def _simulate(self) -> None:
+        """MuJoCo's part of a step. It runs beside other Python threads."""
         self._mujoco.mj_step(self.model, self.data, nstep=self.frame_skip)
+
+    def _end(self, x_before: float, action_squared: np.floating) -> Step:
+        """What `step` returns, after MuJoCo's part."""
         x = float(self._qpos[0])
         x_velocity = (x - x_before) / self._dt
-        ctrl_cost = float(self.ctrl_cost_weight * np.square(action).sum())
+        ctrl_cost = float(self.ctrl_cost_weight * action_squared)
         reward = x_velocity + self.healthy_reward - ctrl_cost
         return self._observe(), reward, not self._healthy(), {"x_position": x, "x_velocity": x_velocity}
 
@@ -89,10 +143,7 @@ class _Locomotion(Robot):
         """Continue from `state` (k,), which `get_state` returned; return the observation."""
         self._mujoco.mj_resetData(self.model, self.data)
         self._mujoco.mj_setState(self.model, self.data, state, self._mujoco.mjtState.mjSTATE_INTEGRATION)
-        # Positions of the bodies, for a picture; the next step computes everything else.
-        self._mujoco.mj_kinematics(self.model, self.data)
-        self._mujoco.mj_comPos(self.model, self.data)
-        self._mujoco.mj_camlight(self.model, self.data)
+        self._place_bodies()  # the next step computes everything else
         return self._observe()
 
     def render(self, width: int = 480, height: int = 480) -> np.ndarray:
@@ -102,6 +153,7 @@ class _Locomotion(Robot):
         """
         if self._picture is None:
             self._picture = _Picture(self._mujoco, self.model, width, height)
+        self._place_bodies()  # a step leaves them where they were before its last time step
         return self._picture.take(self.data)
 
     def close(self) -> None:
@@ -109,6 +161,12 @@ class _Locomotion(Robot):
         if self._picture is not None:
             self._picture.close()
             self._picture = None
+
+    def _place_bodies(self) -> None:
+        """Compute where the bodies, cameras and lights are; the next step does not depend on it."""
+        self._mujoco.mj_kinematics(self.model, self.data)
+        self._mujoco.mj_comPos(self.model, self.data)
+        self._mujoco.mj_camlight(self.model, self.data)
 
     @abstractmethod
     def _perturb(self, rng: np.random.Generator) -> None:
@@ -123,7 +181,19 @@ class _Locomotion(Robot):
 
 
 class HalfCheetah(_Locomotion):
-    """Observation (17,), velocities as they are; action (6,). Never terminates."""
+    """Action (6,): torques of the driven joints, in their order. Never terminates. Observation (17,):
+
+        0      height in m, less the 0.7 m of the model's pose: rootz
+        1      pitch in rad: rooty
+        2-7    angles of the driven joints in rad:
+               bthigh, bshin, bfoot, fthigh, fshin, ffoot
+        8-9    velocities of the torso in m/s: rootx, rootz
+        10     velocity of the pitch in rad/s: rooty
+        11-16  velocities of the driven joints in rad/s:
+               bthigh, bshin, bfoot, fthigh, fshin, ffoot
+
+    A joint has the name that it has in MuJoCo's model.
+    """
 
     model_file, frame_skip, obs_dim, action_dim = "half_cheetah.xml", 5, 17, 6
     ctrl_cost_weight, healthy_reward = 0.1, 0.0
@@ -158,7 +228,17 @@ class _Upright(_Locomotion):
 
 
 class Hopper(_Upright):
-    """Observation (11,), action (3,). Falls below 0.7 m, past 0.2 rad or at a state beyond +-100."""
+    """Action (3,): torques of the driven joints, in their order. Observation (11,), velocities clipped to +-10:
+
+        0     height in m: rootz
+        1     pitch in rad: rooty
+        2-4   angles of the driven joints in rad: thigh_joint, leg_joint, foot_joint
+        5-6   velocities of the torso in m/s: rootx, rootz
+        7     velocity of the pitch in rad/s: rooty
+        8-10  velocities of the driven joints in rad/s: thigh_joint, leg_joint, foot_joint
+
+    Falls below 0.7 m, past 0.2 rad or at a state beyond +-100.
+    """
 
     hyperparameters = "Hopper"  # its group in the paper's table
     model_file, obs_dim, action_dim = "hopper.xml", 11, 3
@@ -170,7 +250,19 @@ class Hopper(_Upright):
 
 
 class Walker2d(_Upright):
-    """Observation (17,), action (6,). Falls outside 0.8 m to 2 m and past 1 rad."""
+    """Action (6,): torques of the driven joints, in their order. Observation (17,), velocities clipped to +-10:
+
+        0      height in m: rootz
+        1      pitch in rad: rooty
+        2-7    angles of the driven joints in rad:
+               thigh_joint, leg_joint, foot_joint, thigh_left_joint, leg_left_joint, foot_left_joint
+        8-9    velocities of the torso in m/s: rootx, rootz
+        10     velocity of the pitch in rad/s: rooty
+        11-16  velocities of the driven joints in rad/s:
+               thigh_joint, leg_joint, foot_joint, thigh_left_joint, leg_left_joint, foot_left_joint
+
+    Falls outside 0.8 m to 2 m and past 1 rad.
+    """
 
     model_file, obs_dim, action_dim = "walker2d.xml", 17, 6
 
@@ -216,6 +308,9 @@ class _Picture:
                 f"the OpenGL backend {backend!r} does not work on this machine ({error!r}); without a "
                 "display, install libegl1 or libosmesa6 and set MUJOCO_GL to 'egl' or 'osmesa'"
             ) from error
+        # called once, by close() or when the object goes
+        self.close = weakref.finalize(self, _free, self._gl, self._context)
+        self.close.atexit = False  # OpenGL may be gone before, and the process frees its memory anyway
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._mujoco, self._model = mujoco, model
         self._scene, self._option = mujoco.MjvScene(model, maxgeom=1000), mujoco.MjvOption()
@@ -235,7 +330,8 @@ class _Picture:
         self._mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)
         return pixels[::-1].copy()  # OpenGL counts rows from below
 
-    def close(self) -> None:
-        self._gl.make_current()
-        self._context.free()
-        self._gl.free()
+
+def _free(gl: Any, context: Any) -> None:
+    gl.make_current()
+    context.free()
+    gl.free()

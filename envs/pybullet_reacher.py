@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import os
 import sys
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
 
 from envs.reacher import TIME_STEP, TORQUE, Reacher
-from envs.robot import Robot, Step, UnavailableError
+from envs.robot import SimulatedRobot, Step, UnavailableError
 
 
 @contextmanager
@@ -32,7 +33,7 @@ def _silent_import() -> Iterator[None]:
         os.close(null)
 
 
-class PyBulletReacher(Robot):
+class PyBulletReacher(SimulatedRobot):
     """One arm in a physics client of its own; observations and actions are those of `Reacher`.
 
     Raises UnavailableError where PyBullet is not installed.
@@ -53,9 +54,12 @@ class PyBulletReacher(Robot):
                 f" to 3.11 (this is Python {python}); the default simulator gives the same joint angles in every bit"
             ) from None
         self._bullet = bullet = pybullet
-        self._client = client = bullet.connect(bullet.DIRECT)
+        client = bullet.connect(bullet.DIRECT)
         if client < 0:
             raise RuntimeError("PyBullet could not start another physics client in this process")
+        # called once: by close(), when the robot goes, or when the process ends
+        self._disconnect = weakref.finalize(self, bullet.disconnect, client)
+        self._own_client = client
         bodies = bullet.loadMJCF(
             os.path.join(pybullet_data.getDataPath(), "mjcf", "reacher.xml"),
             flags=bullet.URDF_USE_SELF_COLLISION | bullet.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS,
@@ -75,6 +79,14 @@ class PyBulletReacher(Robot):
                 self._links[joint[12].decode()] = body, index
                 self._disable_motor(body, index)
         self._potential = 0.0
+        self._to_target = 0.0, 0.0
+        self._built()
+
+    @property
+    def _client(self) -> int:
+        if not self._disconnect.alive:
+            raise RuntimeError("this PyBulletReacher is closed; make a new one")
+        return self._own_client
 
     def reset(self, rng: np.random.Generator) -> np.ndarray:
         """Draw target and joint positions from `rng` (numpy Generator); return the observation (9,)."""
@@ -112,6 +124,21 @@ class PyBulletReacher(Robot):
         stuck = -0.1 if abs(abs(obs[7]) - 1.0) < 0.01 else 0.0
         return obs, float(progress + electricity + stuck), False, {}
 
+    def get_state(self) -> np.ndarray:
+        """Angles, speeds, target, the reported fingertip minus target, and the potential (9,)."""
+        (q1, w1), (q2, w2) = map(self._joint_state, ("joint0", "joint1"))
+        target = self._joint_state("target_x")[0], self._joint_state("target_y")[0]
+        return np.array((q1, q2, w1, w2, *target, *self._to_target, self._potential))
+
+    def set_state(self, state: np.ndarray) -> np.ndarray:
+        """Continue from `state` (9,), which `get_state` returned; return the observation (9,)."""
+        q1, q2, w1, w2, target_x, target_y, dx, dy, potential = state.tolist()
+        self.place(q1, q2, w1, w2, target=(target_x, target_y))
+        obs = self._observe()[0]
+        obs[2:4] = self._to_target = dx, dy  # the reported fingertip is one step late, see `envs.reacher.State`
+        self._potential = potential
+        return obs
+
     def render(self) -> np.ndarray:
         """The picture that `Reacher` makes (480, 480, 3), uint8; PyBullet's own would need its slow renderer."""
         arm = Reacher()
@@ -122,9 +149,7 @@ class PyBulletReacher(Robot):
 
     def close(self) -> None:
         """Free the physics client; closing twice is harmless."""
-        if self._client is not None:
-            self._bullet.disconnect(physicsClientId=self._client)
-            self._client = None
+        self._disconnect()
 
     def _disable_motor(self, body: int, index: int) -> None:
         # Bullet gives every joint a velocity motor of its own; one without force lets the joint move freely
@@ -151,6 +176,7 @@ class PyBulletReacher(Robot):
         (theta, theta_velocity), (gamma, gamma_velocity) = map(self._joint_state, ("joint0", "joint1"))
         target_x, target_y = self._joint_state("target_x")[0], self._joint_state("target_y")[0]
         to_target = np.subtract(self._link_position("fingertip"), self._link_position("target"))
+        self._to_target = float(to_target[0]), float(to_target[1])
         obs = np.array(
             [
                 target_x,

@@ -253,11 +253,14 @@ class State(NamedTuple):
 
 
 class Reacher(Robot):
-    """One arm.
+    """One arm. Action (2,): torques of the two joints in units of 0.05. Observation (9,):
 
-    Observation (9,): target x, y; fingertip minus target x, y; cos and sin of joint 0; its velocity
-    (x 0.1); joint 1's position (mapped to +-1 over its limits of +-3 rad) and velocity (x 0.1).
-    Action (2,): torques of the two joints in units of 0.05.
+    0-1  target, x and y in m
+    2-3  fingertip minus target, x and y in m; the fingertip is that of a step ago
+    4-5  cos and sin of the angle of joint 0
+    6    0.1 times the velocity of joint 0 in rad/s
+    7    the angle of joint 1 in rad divided by 3, its limit
+    8    0.1 times the velocity of joint 1 in rad/s
     """
 
     hyperparameters = "Reacher"  # its group in the paper's table

@@ -16,12 +16,19 @@ class UnavailableError(ValueError):
     """A simulator is not installed on this machine, or the robot does not have it; the message is one line."""
 
 
+class RobotError(ValueError):
+    """A robot does not keep the protocol of `Robot`; the message is one line that names the mistake."""
+
+
 class Robot(ABC):
     """One simulated robot. A robot of your own derives from this class and appears in a row of `envs.TASKS`.
 
     An episode must depend on its reset and its actions alone, not on earlier episodes. Observations are new float64
     arrays, which the caller may keep and change. The environment around a robot checks actions, counts steps and ends
-    an episode after `max_episode_steps`; a robot does none of that.
+    an episode after `max_episode_steps`; a robot does none of that. `envs.check_robot` tests all this.
+
+    A robot is made without arguments. A copied or pickled environment makes a new robot and gives it the state of the
+    old one, or repeats the actions of the episode.
     """
 
     obs_dim: int
@@ -69,4 +76,24 @@ class Robot(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Free what the simulator holds; closing twice is harmless."""
+        """Free what the simulator holds; closing twice is harmless. Nothing is asked of a closed robot."""
+
+
+class SimulatedRobot(Robot):
+    """A robot whose simulator cannot be pickled. A copy is a new robot of its class in the same state.
+
+    A subclass calls `_built` at the end of its constructor. What the constructor sets up is set up anew in a copy;
+    attributes that come later are copied.
+    """
+
+    def _built(self) -> None:
+        self._set_up = frozenset(vars(self)) | {"_set_up"}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        later = {name: value for name, value in vars(self).items() if name not in self._set_up}
+        return type(self), (), (later, self.get_state())
+
+    def __setstate__(self, content: tuple[dict[str, Any], np.ndarray]) -> None:
+        later, state = content
+        vars(self).update(later)
+        self.set_state(state)

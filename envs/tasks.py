@@ -7,15 +7,12 @@ theta_2 is the joint angle divided by 3.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from constraints import (
     Ball,
     Box,
-    Constraint,
     HalfSpace,
     PlanarEllipse,
     WeightedL1,
@@ -24,19 +21,7 @@ from constraints import (
 )
 from envs.locomotion import HalfCheetah, Hopper, Walker2d
 from envs.reacher import Reacher
-from envs.robot import Robot
-
-
-@dataclass(frozen=True)
-class Task:
-    """`robot`: its simulation; `constraint`: the feasible set, the action box included; `description` in
-    words and `formula` in LaTeX: that set without the box; `steps`: environment steps of a training run."""
-
-    robot: type[Robot]
-    constraint: Constraint
-    description: str
-    formula: str
-    steps: int
+from envs.registry import TASKS, Task
 
 
 def _reacher_velocities(obs: Tensor) -> Tensor:
@@ -77,7 +62,7 @@ REACHER_STEPS, LOCOMOTION_STEPS = 300_000, 1_000_000
 _OUTPUT = "total absolute mechanical power at most {}"
 _POSITIVE = "total positive mechanical power at most {}"
 
-TASKS = {
+_PAPER = {
     "R+N": Task(
         Reacher,
         Box(2),
@@ -170,3 +155,5 @@ TASKS = {
         LOCOMOTION_STEPS,
     ),
 }
+
+TASKS.update(_PAPER)

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from plots.grouping import Groups
+from plots.grouping import DAGGER, Groups, count_diverged
 from plots.paper import order_algos
 from plots.statistics import (
     CONFIDENCE,
@@ -40,6 +40,12 @@ class Aggregates:
     means: dict[str, Estimate]
     improvements: dict[tuple[str, str], Estimate]
     """Of the first algorithm over the second, where they have tasks in common."""
+    diverged: set[str]
+    """Algorithms with seeds that diverged, and count with their best parameters before."""
+
+    def label(self, algo: str) -> str:
+        """The name of `algo`, with a dagger where seeds diverged."""
+        return algo + DAGGER * (algo in self.diverged)
 
 
 def aggregate(groups: Groups) -> list[Aggregates]:
@@ -54,7 +60,13 @@ def aggregate(groups: Groups) -> list[Aggregates]:
             elif scores[first].keys() & scores[second].keys():
                 improvements[first, second] = probability_of_improvement(scores[first], scores[second])
         means = {algo: interquartile_mean(by_task) for algo, by_task in scores.items()}
-        result.append(Aggregates(settings, scores, means, improvements))
+        diverged = {
+            algo
+            for condition, by_algo in groups.items()
+            for algo, runs in by_algo.items()
+            if condition.settings == settings and condition.task in scores.get(algo, {}) and count_diverged(runs)
+        }
+        result.append(Aggregates(settings, scores, means, improvements, diverged))
     return result
 
 
@@ -68,7 +80,13 @@ def mean_table(aggregates: Sequence[Aggregates]) -> Table:
                 runs = sum(len(values) for values in aggregate.scores[algo].values())
                 value, low, high = (float(x) for x in aggregate.means[algo])
                 label = ", ".join(filter(None, (" ".join(tasks), aggregate.settings)))
-                texts = (label if not rows else "", algo, str(runs), f"{value:.3f}", f"{low:.3f} to {high:.3f}")
+                texts = (
+                    label if not rows else "",
+                    aggregate.label(algo),
+                    str(runs),
+                    f"{value:.3f}",
+                    f"{low:.3f} to {high:.3f}",
+                )
                 rows.append(text_cells(*texts))
                 record = {"settings": aggregate.settings, "algo": algo, "tasks": " ".join(tasks), "runs": runs}
                 records.append(record | {"interquartile_mean": value, "low": low, "high": high})
@@ -85,7 +103,7 @@ def improvement_table(aggregates: Sequence[Aggregates]) -> Table:
     for aggregate in aggregates:
         rows: list[list[TableCell]] = []
         for first in aggregate.scores:
-            cells = text_cells("" if rows else aggregate.settings, first)
+            cells = text_cells("" if rows else aggregate.settings, aggregate.label(first))
             for second in algos:
                 estimate = aggregate.improvements.get((first, second))
                 if estimate is None:
@@ -105,18 +123,23 @@ def improvement_table(aggregates: Sequence[Aggregates]) -> Table:
     return Table("improvement", title, ["Settings", "Algorithm", *algos], 2, sections, records)
 
 
-def draw_aggregates(aggregates: Sequence[Aggregates], folder: Path, formats: Sequence[str]) -> list[Path]:
-    """Interquartile means with profiles, and the matrix of improvements, for each combination of settings."""
+def draw_aggregates(
+    aggregates: Sequence[Aggregates], own: Sequence[str], folder: Path, formats: Sequence[str]
+) -> list[Path]:
+    """Interquartile means with profiles, and the matrix of improvements, for each combination of settings.
+
+    `own` as in `plots.style.color_of`.
+    """
     written = []
     for aggregate in aggregates:
         suffix = f",{aggregate.settings.replace(', ', ',')}" if aggregate.settings else ""
-        written += save(_mean_figure(aggregate), folder, f"aggregate{suffix}", formats)
+        written += save(_mean_figure(aggregate, own), folder, f"aggregate{suffix}", formats)
         if aggregate.improvements:
             written += save(_improvement_figure(aggregate), folder, f"improvement{suffix}", formats)
     return written
 
 
-def _mean_figure(aggregate: Aggregates) -> Figure:
+def _mean_figure(aggregate: Aggregates, own: Sequence[str]) -> Figure:
     """A row of two panels for each set of tasks."""
     blocks = comparable(aggregate.scores)
     heights = [max(2.6, 1.2 + 0.28 * len(algos)) for algos in blocks.values()]
@@ -130,12 +153,12 @@ def _mean_figure(aggregate: Aggregates) -> Figure:
         thresholds = np.linspace(finite.min(initial=0.0), finite.max(initial=1.0), 201)
         for i, algo in enumerate(algos):
             value, low, high = (float(x) for x in aggregate.means[algo])
-            left.plot([low, high], [i, i], color=color_of(algo), linewidth=7, alpha=0.35, solid_capstyle="butt")
-            left.plot(value, i, marker="|", markersize=13, markeredgewidth=2.5, color=color_of(algo))
+            left.plot([low, high], [i, i], color=color_of(algo, own), linewidth=7, alpha=0.35, solid_capstyle="butt")
+            left.plot(value, i, marker="|", markersize=13, markeredgewidth=2.5, color=color_of(algo, own))
             profile = performance_profile(aggregate.scores[algo], thresholds)
-            right.plot(thresholds, profile.value, label=algo, **line_of(algo, len(thresholds)))
-            right.fill_between(thresholds, profile.low, profile.high, color=color_of(algo), alpha=0.12, lw=0)
-        left.set_yticks(range(len(algos)), algos)
+            right.plot(thresholds, profile.value, label=aggregate.label(algo), **line_of(algo, own, len(thresholds)))
+            right.fill_between(thresholds, profile.low, profile.high, color=color_of(algo, own), alpha=0.12, lw=0)
+        left.set_yticks(range(len(algos)), [aggregate.label(algo) for algo in algos])
         left.set_ylim(len(algos) - 0.5, -0.5)
         left.set_xlabel(f"Interquartile mean of the scores, {INTERVAL}")
         right.set_xlabel("Score")
@@ -173,8 +196,9 @@ def _improvement_figure(aggregate: Aggregates) -> Figure:
                 color="white" if dark else "black",
             )
     image = axes.imshow(values, vmin=0.0, vmax=1.0, cmap="RdBu")
-    axes.set_xticks(range(len(algos)), algos, rotation=90)
-    axes.set_yticks(range(len(algos)), algos)
+    labels = [aggregate.label(algo) for algo in algos]
+    axes.set_xticks(range(len(algos)), labels, rotation=90)
+    axes.set_yticks(range(len(algos)), labels)
     axes.set_ylabel("a run of this algorithm ...")
     axes.set_xlabel("... is better than one of this")
     axes.spines[:].set_visible(False)

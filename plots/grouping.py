@@ -28,6 +28,9 @@ class Condition(NamedTuple):
         return ", ".join(filter(None, self))
 
 
+DAGGER = "†"
+"""Marks what has seeds that diverged, and count with their best parameters before."""
+
 Groups = dict[Condition, dict[str, list[Run]]]
 """Runs by condition and algorithm: those of one group differ in nothing but the seed."""
 
@@ -54,7 +57,7 @@ def group_runs(runs: Iterable[Run]) -> tuple[Groups, list[str]]:
     for run in runs:
         # A setting that the algorithm does not have is None, or missing in a run that is older than the setting.
         settings = run.config.items()
-        config = {key: _text(value) for key, value in settings if key not in RUN_KEYS and value is not None}
+        config = {key: setting_text(value) for key, value in settings if key not in RUN_KEYS and value is not None}
         key = run.task, run.algo, tuple(sorted(config.items()))
         group = groups.setdefault(key, _Group(run.task, run.algo, config, dict(run.overrides), {}))
         first = group.runs.setdefault(run.seed, run)
@@ -79,13 +82,14 @@ def _tell_apart(groups: Sequence[_Group]) -> None:
             return
         for members in alike:
             for key in {key for member in members for key in member.config}:
-                values = [member.config.get(key, _text(None)) for member in members]
+                values = [member.config.get(key, setting_text(None)) for member in members]
                 if len(set(values)) > 1:
                     for member, value in zip(members, values, strict=True):
                         member.settings[key] = value
 
 
-def _text(value: Any) -> str:
+def setting_text(value: Any) -> str:
+    """The value of a setting in a label."""
     return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"), default=str)
 
 
@@ -100,9 +104,13 @@ def order_conditions(conditions: Iterable[Condition]) -> list[list[Condition]]:
 
 
 def final_return(run: Run) -> float | None:
-    """The mean return that the run ended with: None while it is unfinished, not finite if it failed."""
+    """The mean return that the run ended with: None while it is unfinished.
+
+    Of a run that diverged, it is that of the best parameters before, and not finite where there is none.
+    """
     if run.failure:
-        return math.nan
+        result = run.failure.get("result")
+        return float(result["return_mean"]) if isinstance(result, dict) else math.nan
     return None if run.result is None else float(run.result["return_mean"])
 
 
@@ -136,14 +144,34 @@ def list_left_out(groups: Groups) -> list[str]:
                 of = f" of {total:,}" if isinstance(total, int) else ""
                 lines.append(f"{condition.label} {algo}: seed {_seeds(unfinished)}, evaluated to step {span}{of}")
             for run in runs:
-                if run.failure:
+                if run.failure and not math.isfinite(final_return(run)):
                     lines.append(f"{condition.label} {algo}: seed {run.seed} {describe_failure(run.failure)}")
             if failed := [run for run in runs if run.finished and not math.isfinite(final_return(run))]:
                 lines.append(f"{condition.label} {algo}: seed {_seeds(failed)} failed, its return is not a number")
     return lines
 
 
+def list_diverged(groups: Groups) -> list[str]:
+    """A line for each cell with seeds that diverged, and count with the best parameters before."""
+    lines = []
+    for condition in chain.from_iterable(order_conditions(groups)):
+        for algo in order_algos(groups[condition]):
+            runs = groups[condition][algo]
+            if count := count_diverged(runs):
+                diverged = [run for run in runs if run.failure and math.isfinite(final_return(run))]
+                which = "; ".join(f"seed {run.seed} {describe_failure(run.failure)}" for run in diverged)
+                said = f"{count} of {len(runs)} seeds diverged; best parameters before"
+                lines.append(f"{condition.label} {algo}: {said}: {which}")
+    return lines
+
+
+def count_diverged(runs: Iterable[Run]) -> int:
+    """How many of `runs` diverged, and count with the best parameters before."""
+    return sum(bool(run.failure) and math.isfinite(final_return(run)) for run in runs)
+
+
 def count_failed(runs: Iterable[Run]) -> int:
+    """How many of `runs` have ended without a finite return."""
     returns = [final_return(run) for run in runs]
     return sum(value is not None and not math.isfinite(value) for value in returns)
 

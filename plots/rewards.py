@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 
-from plots.grouping import Condition, Groups, count_failed, order_conditions, reward_statistics
+from plots.grouping import (
+    DAGGER,
+    Condition,
+    Groups,
+    count_diverged,
+    count_failed,
+    order_conditions,
+    reward_statistics,
+)
 from plots.paper import (
-    COLORS,
     DEFAULT_BATCH,
     FAMILIES,
     PAPER_SEEDS,
@@ -18,6 +25,7 @@ from plots.paper import (
     order_algos,
     read_paper,
 )
+from store.folder import Run
 from tables import MISSING, Table, TableCell, text_cells
 
 
@@ -32,35 +40,62 @@ def decimals(values: Iterable[float]) -> int:
     return 2 if max(abs(value) for value in values) < 100 else 0
 
 
-def reward_table(groups: Groups) -> Table:
-    """The paper's table: mean and standard error, the best three bold, the number of seeds unless it is ten."""
-    statistics = reward_statistics(groups)
-    algos = order_algos({*COLORS, *(algo for row in statistics.values() for algo in row)})
+def reward_table(groups: Groups, beside: bool = False) -> Table:
+    """The paper's table: mean and standard error, the best three bold, the number of seeds unless it is ten.
+
+    It has the columns of the algorithms with results and, if `beside`, the paper's own columns beside them.
+    """
+    statistics, paper = reward_statistics(groups), read_paper() if beside else {}
+    printed = {algo: stat for (*_, algo), stat in paper.items()}
+    algos = _columns(statistics, printed)
+    ours = {algo for row in statistics.values() for algo in row}
+    missing = TableCell((MISSING,), missing=True)
     sections, records = [], []
     for conditions in order_conditions(statistics):
         rows = []
         for condition in conditions:
             row = statistics[condition]
-            digits = decimals(stat.mean for stat in row.values())
+            theirs = {algo: paper.get((condition.task, _batch(condition), algo)) for algo in printed}
+            digits = decimals(stat.mean for stat in (*row.values(), *theirs.values()) if stat)
             best = best_three({algo: stat.mean for algo, stat in row.items()})
             cells = [TableCell(tuple(condition.label.split(", ")))]
             for algo in algos:
                 same = SAME_WITHOUT_CONSTRAINT.get(algo) if condition.task == UNCONSTRAINED else None
                 if algo in row:
-                    failed = count_failed(groups[condition][algo])
-                    lines = describe(row[algo], digits) + ((f"{failed} failed",) if failed else ())
-                    cells.append(TableCell(lines, algo in best))
+                    runs = groups[condition][algo]
+                    cells.append(TableCell(_our_lines(row[algo], digits, runs), algo in best))
                     record = condition._asdict() | {"algo": algo} | row[algo]._asdict()
-                    records.append(record | {"failed": failed, "best_three": int(algo in best)})
-                elif same in row:
-                    cells.append(TableCell(("Same as", same), missing=True, merge=True))
-                else:
-                    cells.append(TableCell((MISSING,), missing=True))
+                    record |= {"failed": count_failed(runs), "diverged": count_diverged(runs)}
+                    record |= {"best_three": int(algo in best)}
+                    if beside:
+                        stat = theirs.get(algo)
+                        record |= {"paper_mean": stat and stat.mean, "paper_se": stat and stat.se}
+                    records.append(record)
+                elif algo in ours or not beside:
+                    cells.append(TableCell(("Same as", same), missing=True, merge=True) if same in row else missing)
+                if algo in printed:
+                    stat = theirs[algo]
+                    cells.append(TableCell(describe(stat, digits)) if stat else missing)
             rows.append(cells)
         sections.append(rows)
     title = "Rewards: mean ± standard error over seeds (n where not ten), best three of a row bold"
-    spans = {name: len(family) for name, family in FAMILIES.items()}
-    return Table("rewards", title, ["Condition", *algos], 1, sections, records, spans)
+    header, spans = ["Condition"], {}
+    for algo in algos:
+        own = [algo] if algo in ours or not beside else []
+        header += [*own, *([f"{algo} (paper)"] if algo in printed else [])]
+    for name, family in FAMILIES.items():
+        if count := sum(head.removesuffix(" (paper)") in family for head in header):
+            spans[name] = count
+    return Table("rewards", title, header, 1, sections, records, spans)
+
+
+def _columns(statistics: Mapping[Condition, Mapping[str, Statistic]], printed: Iterable[str]) -> list[str]:
+    """The algorithms with a column: those with results, those that the paper has, and those that a row has twice."""
+    algos = {*printed, *(algo for row in statistics.values() for algo in row)}
+    for condition, row in statistics.items():
+        if condition.task == UNCONSTRAINED and not printed:
+            algos |= {algo for algo, same in SAME_WITHOUT_CONSTRAINT.items() if same in row}
+    return order_algos(algos)
 
 
 def describe(stat: Statistic, digits: int) -> tuple[str, ...]:
@@ -70,8 +105,17 @@ def describe(stat: Statistic, digits: int) -> tuple[str, ...]:
     return tuple(filter(None, (f"{stat.mean:.{digits}f}", error, count)))
 
 
+def _our_lines(stat: Statistic, digits: int, runs: Sequence[Run]) -> tuple[str, ...]:
+    """The lines of our cell: a dagger and a note where seeds diverged, a note where some have no result."""
+    value, *others = describe(stat, digits)
+    failed, diverged = count_failed(runs), count_diverged(runs)
+    if diverged:
+        value, others = f"{value}{DAGGER}", [*others, f"{diverged} of {len(runs)} diverged"]
+    return (value, *others, *([f"{failed} failed"] if failed else []))
+
+
 def comparison_table(groups: Groups) -> Table:
-    """Our results beside the paper's, for the cells that the paper has.
+    """Our results beside the paper's, where the paper has the cell. It is empty where it has none of them.
 
     Only the batch size chooses the paper's row. Runs with other settings are compared too; the label has those.
     """
@@ -81,28 +125,27 @@ def comparison_table(groups: Groups) -> Table:
         rows = []
         for condition in conditions:
             for algo in order_algos(statistics[condition]):
-                if (theirs := paper.get((condition.task, _batch(condition), algo))) is None:
-                    continue
-                ours = statistics[condition][algo]
-                difference = ours.mean - theirs.mean
-                joint = difference / math.hypot(ours.se, theirs.se)
-                digits = decimals((ours.mean, theirs.mean))
-                rows.append(
-                    text_cells(
-                        condition.label,
-                        algo,
-                        " ".join(describe(ours, digits)),
-                        " ".join(describe(theirs, digits)),
-                        f"{difference:+.{digits}f}",
-                        f"{joint:+.1f}" if ours.n > 1 else MISSING,
-                    )
-                )
+                ours, theirs = statistics[condition][algo], paper.get((condition.task, _batch(condition), algo))
+                digits = decimals((ours.mean, theirs.mean if theirs else ours.mean))
+                texts = [condition.label, algo, " ".join(_our_lines(ours, digits, groups[condition][algo]))]
                 record = condition._asdict() | {"algo": algo} | ours._asdict()
-                record |= {"paper_mean": theirs.mean, "paper_se": theirs.se}
-                records.append(record | {"difference": difference, "joint_errors": joint})
+                if theirs is None:
+                    texts += [MISSING] * 3
+                    record |= dict.fromkeys(("paper_mean", "paper_se", "difference", "joint_errors"))
+                else:
+                    difference = ours.mean - theirs.mean
+                    joint = difference / math.hypot(ours.se, theirs.se)
+                    texts += [" ".join(describe(theirs, digits)), f"{difference:+.{digits}f}"]
+                    texts.append(f"{joint:+.1f}" if ours.n > 1 else MISSING)
+                    record |= {"paper_mean": theirs.mean, "paper_se": theirs.se}
+                    record |= {"difference": difference, "joint_errors": joint}
+                rows.append(text_cells(*texts))
+                records.append(record)
         if rows:
             sections.append(rows)
     title = "Comparison with the paper; the difference also in joint standard errors, where there are several seeds"
+    if all(record["paper_mean"] is None for record in records):
+        sections, records = [], []
     header = ["Condition", "Algorithm", "Ours", "Paper", "Difference", "In joint s.e."]
     return Table("comparison", title, header, 2, sections, records)
 

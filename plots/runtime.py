@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from core.words import ConfigError
 from plots.grouping import statistic
 from plots.paper import Statistic, order_algos
-from plots.style import color_of, plain, save
+from plots.style import color_of, own_algos, plain, save
 from tables import MISSING, Table, text_cells
 
 COLUMNS = ("task", "algo", "batch", "trial", "seeds", "steps", "machine", "cpu_seconds", "gpu_seconds")
@@ -101,8 +101,9 @@ def draw_runtime(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]
             x = i + (j - (len(batches) - 1) / 2) * width
             trials = seconds[algo, batch]
             cpu, gpu = (statistic(part).mean for part in zip(*trials, strict=True))
-            axes.bar(x, gpu, width * 0.9, color=color_of(algo))
-            axes.bar(x, cpu, width * 0.9, bottom=gpu, color=color_of(algo), alpha=0.45)
+            color = color_of(algo, own_algos(algos))
+            axes.bar(x, gpu, width * 0.9, color=color)
+            axes.bar(x, cpu, width * 0.9, bottom=gpu, color=color, alpha=0.45)
             if len(trials) > 1:
                 error = statistic([sum(trial) for trial in trials]).se
                 axes.errorbar(x, cpu + gpu, error, color="black", linewidth=0.8)

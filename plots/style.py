@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +20,44 @@ LATER = {"DGauge": ("#b5a100", "solid"), "SGauge": ("#ff6f61", "dashed")}
 """Colours and lines of methods that are newer than the paper."""
 
 
-def color_of(algo: str) -> str:
+OWN_COLORS = (
+    "#0000ff",
+    "#ff1493",
+    "#00c800",
+    "#8b0000",
+    "#ffc400",
+    "#00bfff",
+    "#6a5acd",
+    "#808000",
+    "#a0a0a0",
+    "#d2a679",
+)
+OWN_LINES = ("dashdot", "dotted", (0, (5, 1, 1, 1, 1, 1)))
+"""Colours and lines of algorithms of one's own. Those of one folder of results take them in turn."""
+
+
+def own_algos(algos: Iterable[str]) -> list[str]:
+    """The names among `algos` that have no colour yet, in a fixed order; `color_of` and `line_of` take it."""
+    return sorted({algo for algo in algos if algo not in COLORS and algo not in LATER})
+
+
+def color_of(algo: str, own: Sequence[str]) -> str:
+    """The colour of `algo`; `own` are the algorithms of one's own in the folder of results (`own_algos`)."""
     if algo in LATER:
         return LATER[algo][0]
-    # An unknown name gets a grey that depends on the name alone.
-    return COLORS.get(algo) or str(0.3 + 0.4 * (sum(algo.encode()) % 8) / 7)
+    return COLORS.get(algo) or OWN_COLORS[own.index(algo) % len(OWN_COLORS)]
 
 
-def line_of(algo: str, points: int) -> dict[str, Any]:
-    """Keywords of a line through so many points."""
-    line = "dashed" if algo in FAMILIES["SAC family"] else "solid" if algo in COLORS else "dashdot"
-    line = LATER[algo][1] if algo in LATER else line
+def line_of(algo: str, own: Sequence[str], points: int) -> dict[str, Any]:
+    """Keywords of a line through so many points; `own` as in `color_of`."""
+    if algo in LATER:
+        line: Any = LATER[algo][1]
+    elif algo in COLORS:
+        line = "dashed" if algo in FAMILIES["SAC family"] else "solid"
+    else:
+        line = OWN_LINES[own.index(algo) // len(OWN_COLORS) % len(OWN_LINES)]
     marker = "." if 0 < points < 20 else ""
-    return {"color": color_of(algo), "linestyle": line, "linewidth": 1.5, "marker": marker}
+    return {"color": color_of(algo, own), "linestyle": line, "linewidth": 1.5, "marker": marker}
 
 
 def plain(axes: Axes) -> None:

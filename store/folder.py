@@ -6,10 +6,11 @@
         info.json        versions, git commit, machine, threads, the command that ran, the words of the cell, the user's
                          own sources with their checksums, start time; again for each resumption
         evaluations.csv  step,return_mean,return_1,...,return_k,seconds: one row an evaluation, appended
-        training.csv     step and the algorithm's own measures (SAC: temperature, entropy), from the first update on
+        training.csv     step and the algorithm's own measures (SAC: temperature, entropy; TD3: losses, mean Q)
         best.pt last.pt  state dicts
         result.json      the final evaluation; written last, so its presence means that the run is finished
-        failed.json      instead of result.json if the run diverged: the step, what was not finite, last evaluation
+        failed.json      instead of result.json if the run diverged: the step, what was not finite, last evaluation,
+                         and as `result` the final evaluation of the best parameters before, where there are any
         checkpoint/      while the run is unfinished: see store/checkpoint.py
     results/<task>/<variant>/seed=<n>.lock
                          while a process trains the run: its process id, host and Slurm job; see store/lock.py
@@ -345,7 +346,9 @@ def read_results(
 
 def describe_failure(failure: Mapping[str, Any]) -> str:
     """The content of `failed.json` in one line."""
-    return f"failed at step {failure['step']}: {failure['quantity']}"
+    result = failure.get("result")
+    before = f" (best parameters before: return {result['return_mean']:.2f})" if isinstance(result, dict) else ""
+    return f"failed at step {failure['step']}: {failure['quantity']}{before}"
 
 
 def _parse(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ class SlurmSettings:
 
     partition: str | None = field(default=None, metadata={"help": "partition (default: the cluster's)"})
     gpus: int = field(default=0, metadata={"help": "GPUs a cell"})
-    cpus: int = field(default=1, metadata={"help": "CPUs a cell, and threads where threads= is not given"})
+    cpus: int = field(default=1, metadata={"help": "CPUs a cell, and its threads where threads= is not given"})
     hours: float = field(default=24.0, metadata={"help": "time limit; a longer cell is requeued and resumes"})
     parallel: int = field(default=256, metadata={"help": "cells running at the same time, at most"})
 

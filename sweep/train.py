@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,18 +14,18 @@ import torch
 
 import envs
 from algos import ALGORITHMS, setting_keys
-from core.config import RUN_KEYS, Config
+from core.config import AUTO, RUN_KEYS, THREADS, Config
 from core.trainer import Trainer
-from core.words import ConfigError, parse_words
-from envs import TASKS, TOLERANCE
+from core.words import ConfigError, known_name, parse_words
+from envs import TASKS
 from store.checkpoint import Checkpoint, CheckpointFolder, FormatError, group_checkpoints
-from store.files import one_line
 from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
 from store.interrupt import Interrupted
 from store.lock import run_lock
 from store.output import forgiving_output
 from store.provenance import command_line, describe_environment
 from sweep.cells import Cell, make_cells
+from sweep.check import check_training
 from sweep.definition import check_definition, define
 from sweep.exit import Exit, stoppable
 from sweep.plugins import load_plugins, refuse_to_train_in_plugin
@@ -57,13 +58,14 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
 
     Prints each result and its folder. Returns whether every seed has a result.
     """
-    config, folders = cell.config, dict(zip(cell.seeds, cell.folders, strict=True))
+    config, folders = on_this_machine(cell.config), dict(zip(cell.seeds, cell.folders, strict=True))
     definition = define(config.env, config.algo)  # before its objects are used, which may change them
-    torch.set_num_threads(config.threads)
+    torch.set_num_threads(int(config.threads))
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
         torch.cuda.set_device(config.device)
-    check_constraint(config.env, config.simulator)
+    check_robot(config.env)
+    check_training(config, partial(make_env, config.env, config.simulator))
     torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     if config.steps <= config.learning_starts:
         print(
@@ -130,6 +132,20 @@ def make_trainer(
         ) from error
 
 
+def on_this_machine(config: Config, threads: int | None = None) -> Config:
+    """`config` with the device and the threads for which "auto" stands here; `threads` for a cell that is not alone.
+
+    Both change the rounding of what is learned, and the chaos of training makes another run of it.
+    """
+    device = config.device
+    if device == AUTO:
+        gpu_pays = torch.cuda.is_available() and not TASKS[config.env].constraint.solved_on_cpu
+        device = "cuda" if gpu_pays else "cpu"
+    if config.threads == AUTO:
+        config = replace(config, threads=threads or THREADS[torch.device(device).type])
+    return replace(config, device=device)
+
+
 def check_device(name: str) -> None:
     """Raise ConfigError if PyTorch cannot compute on the device `name`."""
     choices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -147,21 +163,18 @@ def make_env(task: str, simulator: str | None) -> envs.ActionConstrainedEnv:
         raise ConfigError(str(error)) from error
 
 
-def check_constraint(task: str, simulator: str | None) -> None:
-    """Raise ConfigError if the constraint of `task` does not work on its robot, or if the simulator is not there."""
-    constraint = TASKS[task].constraint
-    env = make_env(task, simulator)
+def check_robot(task: str) -> None:
+    """Raise ConfigError if the robot of `task` does not keep the protocol of `envs.Robot` in a few steps.
+
+    So it does if no algorithm has hyperparameters for the group that the robot names.
+    """
+    robot = envs.TASKS[task].robot
+    groups = {group: None for algorithm in ALGORITHMS.values() for group in algorithm.agent.paper}
+    known_name(f"hyperparameters of {robot.__name__}", robot.hyperparameters, groups)
     try:
-        obs = torch.from_numpy(env.reset(seed=0)[0]).float().unsqueeze(0)
-        if constraint.dim != env.robot.action_dim:
-            raise ValueError(f"it is for {constraint.dim} action coordinates, the robot has {env.robot.action_dim}")
-        action = constraint.project(obs, torch.ones(1, constraint.dim))
-        if action.shape != (1, constraint.dim) or not constraint.violation(obs, action).item() <= TOLERANCE:
-            raise ValueError(f"it projects (1, ..., 1) to {action.tolist()} at a first observation")
-    except Exception as error:  # the constraint may be the user's own code
-        raise ConfigError(f"the constraint of {task} does not work: {one_line(error)}") from error
-    finally:
-        env.close()
+        envs.check_robot(robot, steps=10)
+    except envs.RobotError as error:
+        raise ConfigError(f"the robot of {task} does not work: {error}") from error
 
 
 def _device_name(device: str) -> str:
@@ -214,8 +227,9 @@ def _resume(
             print(f"{folders[seed]}: resuming from step {group[seed].step}")
     if len(seeds) < len(before):
         print(f"(trained with other seeds before, {len(before)} in all: equal up to rounding to an unbroken run)")
-    if (threads := group[seeds[0]].settings["threads"]) != config.threads:
-        print(f"(threads={config.threads} now, {threads} before: equal up to rounding to an unbroken run)")
+    for key, now in (("threads", config.threads), ("device", config.device)):
+        if (earlier := group[seeds[0]].settings[key]) != now:
+            print(f"({key}={now} now, {earlier} before: equal up to rounding to an unbroken run)")
     trainer = make_trainer(config, seeds, writers, True, stop_if_asked)
     trainer.restore([group[seed] for seed in seeds])
     _run(trainer)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from core.random import stream_seed
 from envs import ActionConstrainedEnv
 from plots.grouping import count_failed, group_runs, list_left_out
 from store.folder import read_results, read_run
+from store.interrupt import Interrupted
 
 WORDS = (
     "seed=3,5,8 steps=120 learning_starts=40 batch_size=8 hidden=[8,8] eval_every=60 eval_episodes=1 final_episodes=1"
@@ -117,18 +119,34 @@ def test_a_failed_run_is_reported_and_not_run_again_unless_asked(tmp_path, monke
     assert read_results(tmp_path)[1] == [f"{folder / 'failed.json'}: no step or no quantity"]
 
 
-def test_after_a_failure_the_others_resume_exactly(tmp_path, monkeypatch):
+@pytest.mark.parametrize("call, recorded", [(300, []), (450, ["seed=5"])])
+def test_after_a_failure_the_others_resume_exactly(tmp_path, monkeypatch, call, recorded):
+    """Interrupted while the best parameters of the failed seed are evaluated, and after that."""
     words = f"algo=DPre env=R+N {WORDS}"
     train(tmp_path / "sound", words)
-    with monkeypatch.context() as patch:
-        poison(patch, "DPre", spoil("critic", math.nan))
-        check = Breaks(300)
-        with pytest.raises(type(check.error)):
-            train(tmp_path / "spoiled", words, check)
-    assert list(failures(tmp_path / "spoiled")) == ["seed=5"]
+    for name, check in (("unbroken", lambda: None), ("spoiled", Breaks(call))):
+        with monkeypatch.context() as patch:
+            poison(patch, "DPre", spoil("critic", math.nan))
+            with pytest.raises(Interrupted) if name == "spoiled" else nullcontext():
+                train(tmp_path / name, words, check)
+    assert list(failures(tmp_path / "spoiled")) == recorded
     assert train_through(tmp_path / "spoiled", words, Breaks(10, 60)) == 2
     sound = outcome(tmp_path / "sound")
+    records = [failures(tmp_path / name)["seed=5"] for name in ("unbroken", "spoiled")]
+    assert records[0].pop("seconds") and records[1].pop("seconds") and records[0] == records[1]
     assert_identical({seed: sound[seed] for seed in ("seed=3", "seed=8")}, outcome_of_finished(tmp_path / "spoiled"))
+
+
+def test_the_best_parameters_of_a_failed_seed_get_their_final_evaluation(tmp_path, monkeypatch):
+    words = f"algo=DPre env=R+N {WORDS}".replace("final_episodes=1", "final_episodes=3")
+    train(tmp_path / "sound", words.replace("steps=120", "steps=60"))
+    poison(monkeypatch, "DPre", spoil("critic", math.nan))
+    assert run_command([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
+    (failure,) = failures(tmp_path / "spoiled").values()
+    # Training to step 60 leaves the same best parameters, which meet the same final episodes.
+    expected = outcome(tmp_path / "sound")["seed=5"]["result"]
+    assert failure["result"] == {key: expected[key] for key in ("return_mean", "returns", "best_step")}
+    assert len(failure["result"]["returns"]) == 3 and failure["executed_actions"] == 86 + 150 + 3 * 150
 
 
 def test_all_seeds_may_fail(tmp_path, monkeypatch):

@@ -4,19 +4,19 @@ Without a GPU, a stand-in for CUDA's graphs calls the captured operations again 
 PyTorch's meta device shows that a step asks nothing of its device.
 """
 
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 
 import pytest
 import torch
 from helpers import cells_of, config_of, run_command
 
+import core.ahead
 import core.cuda_graph
 import envs
 from algos import ALGORITHMS
 from constraints import LinearConstraint
 from core.cuda_graph import EAGER_STEPS, GradientSteps
-from core.random import Tape
 from core.replay import Batch, Replay
 from store.folder import read_run
 from store.interrupt import Interrupted
@@ -84,29 +84,24 @@ def cuda_stand_in(monkeypatch):
         type = "cuda"
 
     class Captured(core.cuda_graph.CapturedStep):
-        def __init__(self, agent, step, tape):
+        def __init__(self, agent, step):
             def again():
-                tape.rewind()
-                updates, streams = agent.updates, (agent.update_noise, steps_of[0].replay.streams)
-                for each in streams:
-                    each.tape = tape
+                updates = agent.updates
                 step()
-                for each in streams:
-                    each.tape = None
                 agent.updates = updates  # a graph's Python code does not run again
 
             @contextmanager
             def capture(graph):
-                before = outcome(agent)
+                before, rows = outcome(agent), [streams.ahead.row.clone() for streams in steps_of[0].streams]
                 yield
                 for i, state in enumerate(before):
-                    updates = agent.updates
-                    agent.load_training_state(i, state)
-                    agent.updates = updates
+                    agent.load_training_state(i, state | {"updates": agent.updates})
+                for streams, row in zip(steps_of[0].streams, rows, strict=True):
+                    streams.ahead.row.copy_(row)
                 graph.call = again
 
             monkeypatch.setattr(torch.cuda, "graph", capture)
-            super().__init__(agent, step, tape)
+            super().__init__(agent, step)
 
     steps_of = []
 
@@ -122,18 +117,25 @@ def cuda_stand_in(monkeypatch):
             finally:
                 self.agent.device = device
 
-        def _step_aside(self, kind):
-            self.tapes[kind] = Tape()
-            with self._using(self.tapes[kind]):
-                self._step()
+    class Stream:
+        def __init__(self, device=None):
+            pass
 
+        def wait_stream(self, stream):
+            pass
+
+    monkeypatch.setattr(torch.cuda, "Stream", Stream)
+    monkeypatch.setattr(torch.cuda, "current_stream", Stream)
+    monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
     monkeypatch.setattr(torch.cuda, "CUDAGraph", FakeGraph)
     monkeypatch.setattr(core.cuda_graph, "CapturedStep", Captured)
     return Steps
 
 
 @pytest.mark.parametrize("name", ["DPre+", "DRad", "NFW", "SPre", "SAlpha"])
-def test_repeated_steps_draw_the_numbers_of_eager_ones(name, cuda_stand_in, monkeypatch):
+@pytest.mark.parametrize("block", [4, core.ahead.BLOCK])
+def test_repeated_steps_draw_the_numbers_of_eager_ones(name, block, cuda_stand_in, monkeypatch):
+    monkeypatch.setattr(core.ahead, "BLOCK", block)
     eager, repeated = make(name), make(name)
     train(*eager)
     monkeypatch.setitem(globals(), "GradientSteps", cuda_stand_in)
@@ -145,18 +147,7 @@ def test_repeated_steps_draw_the_numbers_of_eager_ones(name, cuda_stand_in, monk
         for what in ("parameters", "optimizers", "memory", "streams"):
             assert one[what].keys() == other[what].keys()
             assert all(torch.equal(value, other[what][key]) for key, value in one[what].items()), what
-    assert torch.equal(*(replay.streams.generators[1].get_state() for replay in (eager[1], repeated[1])))
-
-
-def test_a_tape_hands_out_the_same_tensors_and_draws_anew_only_when_told():
-    numbers = iter(range(10))
-    tape = Tape()
-    first, second = (tape.deliver(lambda: torch.tensor([next(numbers)]), torch.device("cpu")) for _ in range(2))
-    tape.rewind()
-    assert tape.deliver(None, None) is first and tape.deliver(None, None) is second
-    assert [first.item(), second.item()] == [0, 1]
-    tape.draw_again()
-    assert [first.item(), second.item()] == [2, 3]
+    assert torch.equal(*(replay.streams.state(1) for replay in (eager[1], repeated[1])))
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -177,12 +168,13 @@ def test_a_gradient_step_asks_nothing_of_its_device(name, task):
 @needs_cuda
 @pytest.mark.parametrize("name", ALGORITHMS)
 @pytest.mark.parametrize("task", ["W+M", "HC+O", "R+T"])
-def test_cuda_learns_what_the_cpu_learns_and_never_waits(name, task):
+def test_cuda_learns_what_the_cpu_learns_and_never_waits(name, task, monkeypatch):
+    monkeypatch.setattr(core.ahead, "BLOCK", 4)
     here, there = make(name, task), make(name, task, "cuda")
     train(*here)
     steps = GradientSteps(there[0], there[1], BATCH)
     for number in range(STEPS):
-        torch.cuda.set_sync_debug_mode("error" if number > EAGER_STEPS * there[0].cycle else "default")
+        torch.cuda.set_sync_debug_mode("error" if number >= (EAGER_STEPS + 1) * there[0].cycle else "default")
         try:
             steps()
         finally:
@@ -222,6 +214,40 @@ def test_a_run_on_a_gpu_is_interrupted_and_resumed_with_the_same_bits(name, tmp_
         assert one["returns"] == other["returns"]
         parameters = [torch.load(folder / "last.pt", weights_only=True) for folder in (whole, broken)]
         assert all(torch.equal(value, parameters[1][key]) for key, value in parameters[0].items())
+
+
+def test_a_captured_step_goes_on_from_any_moment(cuda_stand_in, monkeypatch):
+    """A checkpoint in the middle of a block holds the streams as they are without blocks."""
+    monkeypatch.setitem(globals(), "GradientSteps", cuda_stand_in)
+    whole, broken = make("DPre"), make("DPre")
+    train(*whole)
+    step = GradientSteps(broken[0], broken[1], BATCH)
+    for number in range(STEPS):
+        step()
+        broken[2](5)
+        if number == 8:
+            saved = outcome(broken[0])
+            sampling = [broken[1].streams.state(i) for i in range(len(SEEDS))]
+    agent, replay, grow = make("DPre")
+    for _ in range(9):
+        grow(5)
+    for i, state in enumerate(saved):
+        agent.load_training_state(i, state)
+        replay.streams.load_state(i, sampling[i])
+    step = GradientSteps(agent, replay, BATCH)
+    for _ in range(9, STEPS):
+        step()
+        grow(5)
+    for one, other in zip(outcome(whole[0]), outcome(agent), strict=True):
+        for what in ("parameters", "streams"):
+            assert all(torch.equal(value, other[what][key]) for key, value in one[what].items()), what
+
+
+def test_an_algorithm_that_does_not_count_its_steps_is_an_error(cuda_stand_in, monkeypatch):
+    agent, replay, _ = make("DPre")
+    monkeypatch.setattr(agent, "update", lambda batch: None)
+    with pytest.raises(RuntimeError, match="must count its steps"):
+        cuda_stand_in(agent, replay, BATCH)()
 
 
 def test_a_set_that_is_solved_on_the_cpu_is_never_captured(cuda_stand_in, monkeypatch):

@@ -217,15 +217,21 @@ def test_a_state_of_another_simulator_is_refused(bullet):
         envs.make("R+N").set_state(env.get_state())
 
 
-def test_pybullet_repeats_an_episode_from_its_actions(bullet):
-    """A robot without a state of its own is resumed so."""
+@pytest.mark.parametrize("stateless", [False, True])
+def test_pybullet_goes_on_from_its_state_and_by_repeating_actions(bullet, stateless, monkeypatch):
+    """A robot without a state of its own is resumed by its actions, as PyBullet was in earlier checkpoints."""
+    if stateless:
+        monkeypatch.setattr(PyBulletReacher, "get_state", lambda self: None)
     env, other = (envs.make("R+N", simulator="pybullet") for _ in range(2))
     env.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1, 1, (40, 2))
     for action in actions[:20]:
         env.step(action)
     state = env.get_state()
-    assert state["robot"] is None and state["actions"].shape == (20, 2)
+    if stateless:
+        assert state["robot"] is None and state["actions"].shape == (20, 2)
+    else:
+        assert state["robot"].shape == (9,) and state["actions"] is None
     other.set_state(state)
     for action in actions[20:]:
         np.testing.assert_array_equal(other.step(action)[0], env.step(action)[0])

@@ -79,7 +79,7 @@ class Counter(Agent):
 
     def __init__(self, config, seeds, scores=()):
         super().__init__(config, CONSTRAINT, OBS, seeds, map=Alpha(), placement="layer")
-        self.scores, self.rollouts, self.trainer = scores, [], None
+        self.scores, self.rollouts, self.episodes, self.trainer = scores, [], [], None
 
     def build(self, init):
         self.net = nn.Module()
@@ -107,6 +107,9 @@ class Counter(Agent):
         assert batch.obs.shape == (len(self.seeds), self.config.batch_size, OBS)
         with torch.no_grad():
             self.net.count += 1
+
+    def start_episode(self, which):
+        self.episodes += [(i, self.trainer.seeds[i].env.episode, self.trainer.seeds[i].env.t) for i in which]
 
     def start_rollout(self, which):
         self.rollouts += [(i, self.trainer.seeds[i].steps) for i in which]
@@ -262,6 +265,15 @@ def test_the_agent_hears_of_every_rollout(tmp_path, train_freq, starts):
     trainer.run()
     for i in range(2):
         assert [step for j, step in trainer.agent.rollouts if j == i] == starts
+
+
+@pytest.mark.parametrize("train_freq", [1, 8, "episode"])
+def test_the_agent_hears_of_every_episode_before_its_first_step(tmp_path, train_freq):
+    trainer = make_trainer(tmp_path, seeds=(4, 6), train_freq=train_freq, gradient_steps=2)
+    trainer.run()
+    for i in range(2):  # of training alone, in warm-up too
+        started = [(episode, t) for j, episode, t in trainer.agent.episodes if j == i]
+        assert started == [(episode, 0) for episode in range(trainer.seeds[i].env.episode + 1)] and len(started) == 9
 
 
 def test_warm_up_actions_then_exploration(tmp_path):
@@ -422,6 +434,7 @@ def test_an_interrupt_while_the_best_parameters_are_in_place_keeps_the_last_ones
 def test_statistics_stand_beside_each_evaluation_after_the_first_gradient_step(tmp_path):
     class Measured(Counter):
         def statistics(self):
+            assert (self.net.count > 0).all()  # not asked before the first gradient step
             return {"count": self.net.count.detach()[:, 0], "double": 2 * self.net.count.detach()[:, 0]}
 
     config = Config("Counter", "Scripted", steps=50, learning_starts=25, batch_size=4, eval_every=20, eval_episodes=2)

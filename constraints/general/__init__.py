@@ -7,5 +7,6 @@ the tensors are. In training, a GPU has to wait for them.
 from constraints.general.intersection import Intersection
 from constraints.general.linear import LinearConstraint
 from constraints.general.quadratic import QuadraticConstraint
+from constraints.general.units import InUnits
 
-__all__ = ["Intersection", "LinearConstraint", "QuadraticConstraint"]
+__all__ = ["InUnits", "Intersection", "LinearConstraint", "QuadraticConstraint"]

@@ -1,15 +1,14 @@
-"""Projection on sets of rows and ellipses and its Jacobian, and the linear oracle of sets with ellipses.
+"""Projection on sets of rows and ellipses, and the linear oracle of sets with ellipses.
 
-- On rows alone: a dual active-set method, exact to rounding. With up to some 20 coordinates it is several times faster
-  than a loop over OSQP, and it stays exact for points far away, where OSQP stops converging.
-- With ellipses: an interior-point method, then Newton's method on the constraints that it found active, exact to
-  rounding. Where that is not the solution: sequential quadratic programming with the active-set method, from the
-  deepest point.
+- On rows alone: a dual active-set method, exact to rounding. It is faster than a loop over OSQP, and stays exact for
+  points far away, where OSQP stops converging.
+- With ellipses: Newton's method, which finds the active constraints of most samples. Where it does not, an
+  interior-point method finds them, then Newton's method again, exact to rounding. Where that is not the solution:
+  sequential quadratic programming with the active-set method, from the deepest point.
 """
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,39 +23,38 @@ from constraints.numerics import one_where_zero, times
 _ACCURACY = 1e-9
 # Newton's method starts so near that it converges in this many steps or has the wrong active constraints.
 _NEWTON_STEPS = 4
+# From a guess it may find the active constraints by itself. If not after this many steps, then hardly ever.
+_GUESSING_STEPS = 10
 # Newton's error is of the order of its last step's square: after one this long, it is rounding.
 _LAST_NEWTON_STEP = 1e-9
 # A solution may leave the set by this much. `violation` reports it as rounding.
 _OUTSIDE = 1e-12
 # The most quadratic programs of one solution; 2 to 10 are enough in most cases.
 _MAX_PROGRAMS = 60
-# Steps of all samples below this end the programs: nothing moves any more.
-_AT_REST = 1e-14
 # The longest last step with which a sample counts as solved. Convergence is quadratic, so its error is rounding.
 _LAST_PROGRAM_STEP = 1e-9
 # The linear oracle as a projection: of a point this far along the slope. One step leaves the square of the error over
 # the step's length, so three are exact to rounding.
 _PROXIMAL_STEP = 1e3
 _PROXIMAL_STEPS = 3
-# Constraints with less slack than this are active in the Jacobian.
-_ACTIVE = 1e-9
-# A unit normal depends on others where its part outside their span is shorter than this.
-_IN_SPAN = 1e-6
-# Singular values of unit normals below this are 0 up to rounding, and so are residuals of sums of them.
-_RANK = 1e-7
 
 
 def closest_points(sets: ScaledSets, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Closest points (n, d) to target (n, d), the Lagrangian's Hessian there (n, d, d), and multipliers (n, m + k)."""
     if not sets.curved:
-        metric = torch.eye(sets.dim, dtype=target.dtype).expand(len(target), sets.dim, sets.dim)
+        metric = torch.eye(sets.dim, dtype=target.dtype, device=target.device).expand(len(target), sets.dim, sets.dim)
         solution, multipliers = project_on_rows(sets.rows, sets.bounds, target, sets.name, sets.given_rows)
         return solution, metric, multipliers
     outside = (sets.depth(target) < 0.0).nonzero().squeeze(-1)
     solution = target.clone()
     multipliers = target.new_zeros(len(target), sets.rows.shape[1] + sets.matrix.shape[1])
     if len(outside) > 0:
-        solution[outside], multipliers[outside] = optimal_points(sets[outside], target[outside], linear=False)
+        part, aim = sets[outside], target[outside]
+        point, exact, done = _newton(part, aim, *_first_guess(part, aim), guess=True)
+        left = (~done).nonzero().squeeze(-1)
+        if len(left) > 0:
+            point[left], exact[left] = optimal_points(part[left], aim[left], linear=False)
+        solution[outside], multipliers[outside] = point, exact
     return solution, _hessian(sets, multipliers), multipliers
 
 
@@ -106,19 +104,42 @@ def _minimize_quadratic(sets: ScaledSets, start: Tensor, curvature: Tensor, grad
     return start + point / size, torch.cat((dual[:, :m], 0.5 * dual[:, m:] / size), -1)
 
 
-def _newton(sets: ScaledSets, target: Tensor, point: Tensor, multipliers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _first_guess(sets: ScaledSets, target: Tensor) -> tuple[Tensor, Tensor]:
+    """A point (n, d) near the projection of the target (n, d), and multipliers (n, m + k) that may be those there.
+
+    It is moved into the box, then straight to the centre of the ellipse that it is furthest out of.
+    """
+    point = target.clamp(-1.0, 1.0)
+    value = sets.ellipse_values(point)[0]
+    largest, first = value.max(-1, keepdim=True)
+    center = sets.center.take_along_dim(first.unsqueeze(-1), 1).squeeze(1)
+    point = torch.lerp(center, point, largest.clamp(min=1.0).rsqrt())
+    normal = sets.ellipse_values(point)[1].take_along_dim(first.unsqueeze(-1), 1).squeeze(1)
+    size = one_where_zero(normal.square().sum(-1, keepdim=True))
+    weight = ((target - point) * normal).sum(-1, keepdim=True).clamp(min=0.0) / size
+    multipliers = target.new_zeros(len(target), sets.rows.shape[1] + value.shape[-1])
+    return point, multipliers.scatter(-1, sets.rows.shape[1] + first, torch.where(largest > 1.0, weight, 0.0))
+
+
+def _newton(
+    sets: ScaledSets, target: Tensor, point: Tensor, multipliers: Tensor, guess: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
     """Newton's method on the optimality conditions, with those constraints active whose multiplier exceeds their slack.
 
-    Returns point, multipliers, and whether (n,) these are the solution.
+    These are the constraints of the start or, for a start that is a `guess`, of each step anew. Returns point,
+    multipliers, and whether (n,) these are the solution.
     """
     d = sets.dim
     active = multipliers > sets.slack(point)[0]
-    slot = active.long().argsort(dim=-1, descending=True, stable=True)[:, :d]
-    used = active.gather(-1, slot)
-    idle = torch.diag_embed((~used).to(point.dtype))
-    multipliers = torch.where(active, multipliers, 0.0)
-    for _ in range(_NEWTON_STEPS):
+    for number in range(_GUESSING_STEPS if guess else _NEWTON_STEPS):
         slack, normals = sets.slack(point)
+        if guess:
+            active = multipliers > slack
+        if number == 0 or guess:
+            slot = active.long().argsort(dim=-1, descending=True, stable=True)[:, : min(d, active.shape[-1])]
+            used = active.gather(-1, slot)
+            idle = torch.diag_embed((~used).to(point.dtype))
+            multipliers = torch.where(active, multipliers, 0.0)
         normals = normals.take_along_dim(slot.unsqueeze(-1), 1) * used.unsqueeze(-1)
         top = torch.cat((_hessian(sets, multipliers), normals.mT), -1)
         system = torch.cat((top, torch.cat((normals, -idle), -1)), 1)
@@ -129,10 +150,12 @@ def _newton(sets: ScaledSets, target: Tensor, point: Tensor, multipliers: Tensor
         step = torch.linalg.solve_ex(system, right.unsqueeze(-1))[0].squeeze(-1)
         point = point + step[:, :d]
         multipliers = torch.zeros_like(multipliers).scatter(-1, slot, held + step[:, d:] * used)
-    near = step[:, :d].abs().amax(-1) <= _LAST_NEWTON_STEP
+        moved = step[:, :d].abs().amax(-1)
+        if guess and bool((moved <= _LAST_NEWTON_STEP).all()):
+            break
     feasible = sets.depth(point) >= -_OUTSIDE
     right_set = (active.sum(-1) <= d) & (multipliers >= 0.0).all(-1)
-    return point, multipliers, near & feasible & right_set
+    return point, multipliers, (moved <= _LAST_NEWTON_STEP) & feasible & right_set
 
 
 def _sequential_programs(sets: ScaledSets, target: Tensor, point: Tensor, multipliers: Tensor) -> tuple[Tensor, Tensor]:
@@ -150,7 +173,7 @@ def _sequential_programs(sets: ScaledSets, target: Tensor, point: Tensor, multip
         step = torch.linalg.solve_triangular(root.mT, step.unsqueeze(-1), upper=True).squeeze(-1)
         point, multipliers = point + step, multipliers / norm
         length = step.abs().amax(-1)
-        if bool((length <= _AT_REST).all()):
+        if bool((length <= _LAST_PROGRAM_STEP).all()):
             break
     require(length <= _LAST_PROGRAM_STEP, "the closest point was not found", sets.name)
     return point, multipliers
@@ -159,68 +182,16 @@ def _sequential_programs(sets: ScaledSets, target: Tensor, point: Tensor, multip
 def _hessian(sets: ScaledSets, multipliers: Tensor) -> Tensor:
     """Hessian (n, d, d) of the projection's Lagrangian for the multipliers (n, m + k)."""
     curvature = multipliers[:, sets.rows.shape[1] :, None, None] * sets.matrix
-    return torch.eye(sets.dim, dtype=multipliers.dtype) + 2.0 * curvature.sum(1)
+    return torch.eye(sets.dim, dtype=multipliers.dtype, device=multipliers.device) + 2.0 * curvature.sum(1)
 
 
 def _pull_towards(sets: ScaledSets, inside: Tensor, point: Tensor) -> Tensor:
-    """The point (n, d), moved towards the interior point `inside` where it leaves the set by rounding."""
+    """The point (n, d), moved towards the interior point `inside` where it leaves the set by more than `_OUTSIDE`."""
     # The excess is first order in the distance moved, and convexity makes the step an upper bound on what is needed.
     rows = times(sets.rows, point) - sets.bounds
     ellipses, value = sets.ellipse_values(point)[0], sets.ellipse_values(inside)[0]
     room = torch.cat((sets.bounds - times(sets.rows, inside), 1.0 - value), -1)
     excess = torch.cat((rows, ellipses - 1.0), -1).clamp(min=0.0)
-    share = torch.where(excess > 0.0, excess / (excess + room), 0.0).amax(-1, keepdim=True)
-    return torch.lerp(point, inside, share)
-
-
-# -------------------------------------------------------------------- Jacobian
-
-
-def projection_jacobian(sets: ScaledSets, solution: Tensor, hessian: Tensor, multipliers: Tensor) -> Tensor:
-    """Jacobian (n, d, d) of the projection: the Hessian's inverse on the subspace that the active constraints leave.
-
-    An active constraint without multiplier is a kink and does not count. The exception: where such constraints block
-    each other within the subspace that the others leave, as at the apex of a pyramid, they all count.
-    """
-    value, gradient = sets.ellipse_values(solution)
-    length = one_where_zero(gradient.norm(dim=-1))
-    normals = torch.cat((sets.rows, gradient / length.unsqueeze(-1)), 1)
-    slack = torch.cat((sets.bounds - times(sets.rows, solution), (1.0 - value) / length), 1)
-    holding = multipliers > 0.0
-    free = _null_projector(normals, holding)
-    other = (slack <= _ACTIVE) & ~holding
-    residual = (normals @ free) * other.unsqueeze(-1)
-    residual = torch.where(residual.norm(dim=-1, keepdim=True) > _IN_SPAN, residual, 0.0)
-    degenerate = ((residual != 0.0).any(-1).sum(-1) > 1).nonzero().squeeze(-1)
-    if len(degenerate) > 0:
-        for i in degenerate.tolist():
-            holding[i] |= _blocked(residual[i])
-        free[degenerate] = _null_projector(normals[degenerate], holding[degenerate])
-    identity = torch.eye(sets.dim, dtype=solution.dtype)
-    return free @ torch.linalg.solve(free @ hessian @ free + identity - free, free)
-
-
-def _null_projector(normals: Tensor, holding: Tensor) -> Tensor:
-    """Projector (n, d, d) on the space orthogonal to the rows of normals (n, m, d) where holding (n, m)."""
-    count = int(holding.sum(-1).max()) if holding.numel() > 0 else 0
-    first = holding.long().argsort(dim=-1, descending=True, stable=True)[:, :count]
-    held = normals.take_along_dim(first.unsqueeze(-1), 1) * holding.gather(-1, first).unsqueeze(-1)
-    _, size, axes = torch.linalg.svd(held, full_matrices=False)
-    axes = axes * (size > _RANK).unsqueeze(-1)
-    return torch.eye(normals.shape[-1], dtype=normals.dtype) - axes.mT @ axes
-
-
-def _blocked(normals: Tensor) -> Tensor:
-    """Which (m,) of the normals (m, d) are orthogonal to every v with normals @ v <= 0.
-
-    Those are the normals whose negative is a sum of the others with weights >= 0.
-    """
-    from scipy.optimize import nnls
-
-    blocked = torch.zeros(len(normals), dtype=torch.bool)
-    present = (normals != 0.0).any(-1).nonzero().squeeze(-1)
-    cone = normals[present].T.numpy()
-    for i in present.tolist():
-        wanted = -normals[i].numpy()
-        blocked[i] = bool(nnls(cone, wanted)[1] <= _RANK * np.linalg.norm(wanted))
-    return blocked
+    share = torch.where(excess > 0.0, excess / (excess + room), 0.0).amax(-1)
+    share = torch.where(sets.depth(point) < -_OUTSIDE, share, 0.0)
+    return torch.lerp(point, inside, share.unsqueeze(-1))

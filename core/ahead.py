@@ -1,0 +1,161 @@
+"""Random numbers of gradient steps to come: drawn many steps at a time, brought to the device in one copy.
+
+A step that is captured in a CUDA graph finds its numbers on the device by itself: it counts its steps there. The
+numbers are those that the streams would have drawn step by step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+BLOCK = 64
+"""Steps whose numbers are drawn at once. It is even, so that a block has an even number of words."""
+
+
+class Draw(NamedTuple):
+    """What a stream draws at once: the kind of numbers, and the shape of a seed's share."""
+
+    kind: Literal["normal", "uniform", "words"]
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    @property
+    def joins(self) -> bool:
+        """Whether one draw of the numbers of many steps gives the numbers of a draw for each step.
+
+        PyTorch makes normal numbers in groups of 16 and begins a new group with each draw.
+        """
+        return self.kind != "normal" or self.size % 16 == 0
+
+    def fill(self, out: Tensor, generator: torch.Generator) -> None:
+        """Draw numbers into the contiguous tensor `out`."""
+        if self.kind == "normal":
+            out.normal_(generator=generator)
+        elif self.kind == "uniform":
+            out.uniform_(-1.0, 1.0, generator=generator)
+        else:
+            pairs = torch.empty(out.numel() // 2, dtype=torch.int64)
+            pairs.random_(-(2**63), None, generator=generator)  # all 64 bits, the first word in the upper half
+            out.copy_((torch.stack((pairs >> 32, pairs), -1) & 0xFFFFFFFF).view(out.shape))
+
+    def skip(self, generator: torch.Generator) -> None:
+        """Leave `generator` as the draw of one step does."""
+        if self.kind == "words":
+            torch.randint(2, self.shape, generator=generator)  # one word for each number
+        else:
+            self.fill(torch.empty(self.shape), generator)
+
+
+class _Block(NamedTuple):
+    first: int  # the kind of its first step
+    start: list[Tensor]  # the states of the generators before it
+    numbers: Tensor  # (seeds, BLOCK, width) on the CPU
+
+
+class Ahead:
+    """The numbers of the coming steps of one purpose. While a block is used up, a thread draws the next one.
+
+    `kinds` has the draws of each kind of step in their order; the kinds take turns.
+    """
+
+    def __init__(self, generators: Sequence[torch.Generator], kinds: Sequence[Sequence[Draw]], device: torch.device):
+        self.generators, self.kinds = generators, kinds
+        self.pinned = device.type == "cuda"
+        self.words = any(draw.kind == "words" for draws in kinds for draw in draws)
+        width = max(sum(draw.size for draw in draws) for draws in kinds)
+        self.block = torch.zeros(len(generators), BLOCK, width, dtype=self._dtype, device=device)
+        self.row = torch.zeros(1, dtype=torch.int64, device=device)  # of the block, that the next step reads
+        self.step: Tensor | None = None  # (seeds, width): the numbers of the step that is computed or captured
+        self.position, self.offset = 0, 0  # of its next draw
+        self.worker = ThreadPoolExecutor(1)
+        self.coming: Future[_Block] | None = None
+        self.start = [generator.get_state() for generator in generators]  # before the first of `drawn` steps
+        self.first, self.taken, self.drawn = 0, 0, 0
+
+    @property
+    def _dtype(self) -> torch.dtype:
+        return torch.int64 if self.words else torch.float32
+
+    # ---------------------------------------------------------------- before each step
+
+    def begin(self, kind: int) -> None:
+        """Have the numbers of the next step on the device; `kind` is its kind."""
+        if self.taken == self.drawn:
+            coming = self.coming or self._draw_later(kind)
+            self.first, self.start, numbers = coming.result()
+            self.block.copy_(numbers, non_blocking=True)
+            self.row.zero_()
+            self.taken, self.drawn = 0, BLOCK
+            self.coming = self._draw_later((self.first + BLOCK) % len(self.kinds))
+        if (self.first + self.taken) % len(self.kinds) != kind:
+            raise RuntimeError("the kinds of gradient steps do not take turns: `update` must count every step")
+        self.taken += 1
+
+    # ---------------------------------------------------------------- within a step, on the device
+
+    def read(self, kind: int) -> None:
+        """Read the numbers of the next step, of which `take` returns each draw."""
+        self.step = self.block.index_select(1, self.row)[:, 0]
+        self.row += 1
+        self.draws, self.position, self.offset = self.kinds[kind], 0, 0
+
+    def take(self, draw: Draw) -> Tensor:
+        """The numbers (seeds, *shape) of the step's next draw."""
+        if self.step is None or self.position == len(self.draws) or self.draws[self.position] != draw:
+            raise RuntimeError(f"a gradient step draws {draw}, which the step before it did not")
+        numbers = self.step[:, self.offset : self.offset + draw.size].reshape(-1, *draw.shape)
+        self.position, self.offset = self.position + 1, self.offset + draw.size
+        return numbers
+
+    # ---------------------------------------------------------------- the streams
+
+    def state(self, i: int) -> Tensor:
+        """The state of generator i as if every step had drawn its numbers itself."""
+        generator = torch.Generator()
+        generator.set_state(self.start[i])
+        for step in range(self.taken):
+            for draw in self.kinds[(self.first + step) % len(self.kinds)]:
+                draw.skip(generator)
+        return generator.get_state()
+
+    def rewind(self) -> None:
+        """Forget the numbers that no step has taken, and put the generators back to before them."""
+        states = [self.state(i) for i in range(len(self.generators))]
+        if self.coming:
+            self.coming.result()
+        for generator, state in zip(self.generators, states, strict=True):
+            generator.set_state(state)
+        self.start, self.coming, self.taken, self.drawn = states, None, 0, 0
+
+    def _draw_later(self, first: int) -> Future[_Block]:
+        # Memory that a copy to the GPU need not wait for. PyTorch gives it to a later block only after that copy.
+        numbers = torch.zeros(self.block.shape, dtype=self._dtype, pin_memory=self.pinned)
+        return self.worker.submit(self._draw, first, numbers)
+
+    def _draw(self, first: int, numbers: Tensor) -> _Block:
+        start = [generator.get_state() for generator in self.generators]
+        draws = self.kinds[0]
+        joined = len(draws) == 1 and draws[0].joins and all(other == draws for other in self.kinds)
+        for rows, generator in zip(numbers, self.generators, strict=True):
+            if joined:
+                draws[0].fill(rows, generator)
+            else:
+                self._draw_steps(first, rows, generator)
+        return _Block(first, start, numbers)
+
+    def _draw_steps(self, first: int, rows: Tensor, generator: torch.Generator) -> None:
+        for step, row in enumerate(rows.unbind()):
+            draws = self.kinds[(first + step) % len(self.kinds)]
+            offset = 0
+            for draw in draws:
+                draw.fill(row[offset : offset + draw.size], generator)
+                offset += draw.size

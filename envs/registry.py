@@ -1,0 +1,127 @@
+"""What a task is, and the table that checks tasks and registers them with Gymnasium."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, MutableMapping
+from dataclasses import dataclass
+from typing import Any
+
+import cloudpickle
+import gymnasium
+from gymnasium.envs.registration import WrapperSpec
+
+from constraints import Constraint
+from envs.check import check_class
+from envs.robot import Robot
+
+_NOT_NAMES = {"all", "figures", "tables"}  # a word of the command line, and folders beside those of the tasks
+
+
+@dataclass(frozen=True)
+class Task:
+    """`robot`: its simulation; `constraint`: the feasible set, the action box included; `description` in
+    words and `formula` in LaTeX: that set without the box; `steps`: environment steps of a training run.
+
+    Raises TypeError or ValueError for parts of another kind or that do not fit together.
+    """
+
+    robot: type[Robot]
+    constraint: Constraint
+    description: str
+    formula: str
+    steps: int
+
+    def __post_init__(self) -> None:
+        robot, constraint, steps = self.robot, self.constraint, self.steps
+        check_class(robot)
+        if not isinstance(constraint, Constraint):
+            raise TypeError(f"a task's constraint is an object of a constraints.Constraint, got {constraint!r}")
+        if constraint.dim != robot.action_dim:
+            raise ValueError(
+                f"the constraint is for {constraint.dim} action coordinates,"
+                f" the robot {robot.__name__} has {robot.action_dim}"
+            )
+        for name in ("description", "formula"):
+            if not isinstance(getattr(self, name), str):
+                raise TypeError(f"a task's {name} is text, got {getattr(self, name)!r}")
+        if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
+            raise ValueError(f"a task's steps are a whole number from 1 on, got {steps!r}")
+
+    def __copy__(self) -> Task:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Task:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A task of the table is pickled as its name, with its definition for a process that does not know the name."""
+        name = next((name for name, task in TASKS.items() if task is self), None)
+        parts = self.robot, self.constraint, self.description, self.formula, self.steps
+        return _find_or_make, (name, cloudpickle.dumps(parts))
+
+
+def _find_or_make(name: str | None, parts: bytes) -> Task:
+    return TASKS[name] if name in TASKS else Task(*cloudpickle.loads(parts))
+
+
+def gymnasium_id(name: str) -> str:
+    """The identifier of the task `name` for `gymnasium.make`; it cannot hold a "+"."""
+    return f"acrl/{name.replace('+', '-')}-v0"
+
+
+class Tasks(MutableMapping[str, Task]):
+    """The table of tasks, name -> `Task`. A new row is checked and registered with Gymnasium.
+
+    A name consists of letters, digits and the signs + - _ . and begins with a letter or a digit. Raises ValueError
+    for another name and for one that is taken, by itself or by its identifier, and TypeError for what is no `Task`.
+    `del TASKS[name]` makes a name free.
+    """
+
+    def __init__(self) -> None:
+        self._rows: dict[str, Task] = {}
+
+    def __getitem__(self, name: str) -> Task:
+        return self._rows[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __repr__(self) -> str:
+        return repr(self._rows)
+
+    def __setitem__(self, name: str, task: Task) -> None:
+        if not isinstance(name, str) or not re.fullmatch(r"[^\W_][\w+.-]*", name) or name.lower() in _NOT_NAMES:
+            raise ValueError(
+                f"bad name of a task {name!r}: expected letters, digits and + - _ . with a letter or a digit first,"
+                f" and none of {', '.join(sorted(_NOT_NAMES))}"
+            )
+        if not isinstance(task, Task):
+            raise TypeError(f"the row {name} of envs.TASKS is an envs.Task, got {task!r}")
+        if name in self._rows:
+            raise ValueError(f"there is a task {name} already; take another name, or del envs.TASKS[{name!r}] first")
+        identifier = gymnasium_id(name)
+        before = gymnasium.registry.get(identifier)
+        if before is not None and before.kwargs.get("task") != name:
+            other = next((other for other in self._rows if gymnasium_id(other) == identifier), "another package")
+            raise ValueError(f"the task {name} would have the identifier {identifier}, which {other} has already")
+        gymnasium.registry.pop(identifier, None)  # this row, where the module is loaded for the second time
+        gymnasium.register(
+            identifier,
+            entry_point="envs.constrained:ActionConstrainedEnv",
+            max_episode_steps=int(task.robot.max_episode_steps),
+            additional_wrappers=(WrapperSpec("GivenTimeLimit", "envs.constrained:GivenTimeLimit", {}),),
+            kwargs={"task": name},
+        )
+        self._rows[name] = task
+
+    def __delitem__(self, name: str) -> None:
+        del self._rows[name]
+        del gymnasium.registry[gymnasium_id(name)]
+
+
+TASKS = Tasks()
+"""The tasks that there are; `envs.tasks` enters the paper's."""

@@ -1,0 +1,107 @@
+"""The tables of what was trained at full length, in README and docs/results.md: `python -m plots.reproduced`.
+
+It reads docs/data and replaces both tables. A test compares them with the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from plots.grouping import group_runs, statistic
+from plots.paper import DEFAULT_BATCH, Statistic, order_algos, order_tasks, read_paper
+from plots.rewards import decimals
+from plots.starts import adjusted_returns, is_on_reacher
+from store.folder import Run
+from store.published import read_published
+from tables import MISSING
+
+ROOT = Path(__file__).parents[1]
+DATA = ROOT / "docs" / "data"
+BEGIN, END = "<!-- made by: python -m plots.reproduced -->\n", "<!-- end -->\n"
+
+Cells = dict[str, dict[str, list[Run]]]
+"""Runs by task and algorithm."""
+
+
+def read_cells(root: str | Path) -> Cells:
+    """The finished runs published in `root` that have the paper's own settings.
+
+    Raises ValueError if a file is corrupt, a run repeats another, or a cell mixes settings.
+    """
+    runs = [published.run for published in read_published(root)]
+    groups, repeated = group_runs(run for run in runs if not run.overrides and run.finished)
+    mixed = [f"{condition.label}: settings differ within a cell" for condition in groups if condition.settings]
+    if repeated or mixed:
+        raise ValueError("; ".join(repeated + mixed))
+    return {condition.task: groups[condition] for condition in groups}
+
+
+def overview(cells: Cells) -> str:
+    """README's table: a row an algorithm, a column a task, our mean beside the paper's."""
+    tasks = order_tasks(cells)
+    rows = [["", *tasks], ["---"] * (len(tasks) + 1)]
+    for algo in order_algos({algo for by_algo in cells.values() for algo in by_algo}):
+        row = [algo]
+        for task in tasks:
+            if runs := cells[task].get(algo):
+                ours, theirs = _results(runs), read_paper().get((task, DEFAULT_BATCH, algo))
+                digits = decimals(stat.mean for stat in (ours, theirs) if stat)
+                row.append(f"**{_text(ours, digits)}** (n={ours.n}) / {_text(theirs, digits)}")
+            else:
+                row.append(MISSING)
+        rows.append(row)
+    return _markdown(rows)
+
+
+def details(cells: Cells) -> str:
+    """The table of docs/results.md: a row a cell, with the results on Reacher adjusted for their starts."""
+    rows = [
+        ["task", "algorithm", "seeds", "final result", "adjusted for the starts", "paper"],
+        ["---"] * 3 + ["---:"] * 3,
+    ]
+    for task in order_tasks(cells):
+        for algo in order_algos(cells[task]):
+            runs = cells[task][algo]
+            ours, theirs = _results(runs), read_paper().get((task, DEFAULT_BATCH, algo))
+            digits = decimals(stat.mean for stat in (ours, theirs) if stat)
+            adjusted = None
+            if is_on_reacher(runs[0]):
+                adjusted = statistic([float(np.mean(adjusted_returns(run))) for run in runs])
+            seeds = ", ".join(str(run.seed) for run in runs)
+            rows.append([task, algo, seeds, *(_text(stat, digits) for stat in (ours, adjusted, theirs))])
+    return _markdown(rows)
+
+
+def _results(runs: Sequence[Run]) -> Statistic:
+    return statistic([float(run.result["return_mean"]) for run in runs])
+
+
+def _text(stat: Statistic | None, digits: int) -> str:
+    if stat is None:
+        return MISSING
+    return f"{stat.mean:.{digits}f}" + (f" ± {stat.se:.{digits}f}" if stat.n > 1 else "")
+
+
+def _markdown(rows: Sequence[Sequence[str]]) -> str:
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+TABLES = {ROOT / "README.md": overview, ROOT / "docs" / "results.md": details}
+"""The table of each document."""
+
+
+def replace_table(text: str, table: str) -> str:
+    """`text` with `table` between its two marks. Raises ValueError if it does not have them."""
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"no table between {BEGIN.strip()!r} and {END.strip()!r}")
+    return f"{before}{begin}{table}{end}{after}"
+
+
+if __name__ == "__main__":
+    for path, make in TABLES.items():
+        path.write_text(replace_table(path.read_text(), make(read_cells(DATA))))

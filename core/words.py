@@ -56,7 +56,7 @@ class NameTable(MutableMapping[str, Row]):
 
 
 def known_name(kind: str, value: object, choices: Iterable[str]) -> str:
-    """Return `value` if it is one of `choices`. Otherwise raise a ConfigError that names them and the closest one."""
+    """Return `value` if it is one of `choices`. Otherwise raise a ConfigError that names the closest one, or them."""
     choices, text = list(choices), str(value)
     if text in choices:
         return text

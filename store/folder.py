@@ -301,8 +301,7 @@ def read_run(folder: str | Path) -> Run:
     """Read a run, finished or in progress. Raises a ValueError that names a missing or corrupt file."""
     folder = Path(folder)
     config = _parse(folder / "config.yaml", lambda text: yaml.load(text, _YamlLoader))
-    variant = str(config.pop("variant", folder.parent.name))
-    algo, overrides = parse_variant(variant)
+    algo, overrides = parse_variant(str(config.get("variant", folder.parent.name)))
     result = None
     if is_finished(folder):
         result = _parse(folder / "result.json", json.loads)
@@ -317,7 +316,7 @@ def read_run(folder: str | Path) -> Run:
         folder=folder,
         task=folder.parent.parent.name,
         algo=algo,
-        variant=variant,
+        variant=folder.parent.name,
         overrides=overrides,
         seed=int(folder.name.removeprefix("seed=")),
         config=config,

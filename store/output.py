@@ -41,8 +41,10 @@ class _Forgiving:
     """A stream whose failures are silent: after the first one, it writes nowhere."""
 
     def __init__(self, stream: Any):
-        self._stream = stream if stream is not None else open(os.devnull, "w")  # noqa: SIM115
-        if isinstance(stream, io.TextIOWrapper) and not stream.closed and stream.errors == "strict":
+        if stream is None or getattr(stream, "closed", False):
+            stream = open(os.devnull, "w")  # noqa: SIM115
+        self._stream = stream
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")
 
     def __getattr__(self, name: str) -> Any:

@@ -24,7 +24,7 @@ from sweep.status import find_cells
 
 ROOT = Path(__file__).parents[1]
 ALGOS = "DPre,SRad,NFW,DAlpha,SPre+"
-STEPS = 6000
+STEPS = 4000
 WORDS = (
     f"env=R+N seed=3,5 steps={STEPS} learning_starts=100 batch_size=4 hidden=[8,8] eval_every=2000 eval_episodes=1"
     " final_episodes=1 checkpoint_every=50 train_freq=1 gradient_steps=1"

@@ -75,7 +75,8 @@ def test_quick_evaluates_little_and_says_so_everywhere(tmp_path, capsys):
     assert run.overrides["quick"] == "true" and run.result["quick"] is True and len(run.result["returns"]) == 2
     assert plot.main([str(tmp_path / "quick"), "format=md,png"]) == 0
     assert "quick=true" in (tmp_path / "quick" / "tables" / "rewards.md").read_text()
-    assert all("quick=true" in path.name for path in (tmp_path / "quick" / "figures").iterdir())
+    figures = [path.name for path in (tmp_path / "quick" / "figures").iterdir()]
+    assert all("quick=true" in name for name in figures if name != "R+N-training.png") and len(figures) >= 2
     train(tmp_path / "whole", words + " eval_episodes=2 final_episodes=1")
     quick, whole = outcome(tmp_path / "quick"), outcome(tmp_path / "whole")
     for seed in quick:  # what is learned is the same

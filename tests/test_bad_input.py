@@ -120,6 +120,7 @@ def test_results_folders_that_cannot_be_written(capsys, monkeypatch, tmp_path, r
 def test_an_end_that_cannot_be_read_is_not_run_over(capsys, tmp_path, name, content):
     folder = tmp_path / "R+N" / VARIANT / "seed=0"
     folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text("algo: DPre\n")
     (folder / name).write_text(content)
     run_command(f"algo=DPre env=R+N {WORDS} results={tmp_path}".split())
     out = capsys.readouterr().out

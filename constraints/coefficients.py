@@ -9,6 +9,7 @@ from __future__ import annotations
 import numbers
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
 from constraints.checks import check_tensor, checked
@@ -43,7 +44,8 @@ class FirstCalls:
 
     def wanted(self) -> bool:
         """Whether to check shapes in this call, and values where `readable` allows it."""
-        return self._left > 0 or _always
+        # torch.compile would compile anew for each number of calls.
+        return (self._left > 0 and not torch.compiler.is_compiling()) or _always
 
     def readable(self, *values: Tensor) -> bool:
         """Whether to check values in this call, which counts."""

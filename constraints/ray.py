@@ -54,7 +54,7 @@ class Ray:
 
     @property
     def gauge(self) -> Tensor:
-        """Gauge L (...) of the offset."""
+        """Gauge L (...) of the offset, without gradients; `Constraint.gauge` has them."""
         return self._gauge_and_gradient[0]
 
     @property

@@ -153,6 +153,27 @@ def test_checks_end_after_the_first_calls_unless_they_are_asked_for():
     constraint.project(obs, action)
 
 
+def test_given_centres_too_are_checked_in_the_first_calls_unless_more_is_asked_for():
+    constraint = Ball(0.5, 2)
+    obs, action, outside = torch.ones(1, 2), torch.ones(1, 2), torch.ones(1, 2)
+    for _ in range(100):
+        constraint.alpha_map(obs, action, torch.zeros(2))
+    constraint.alpha_map(obs, action, outside)
+    check_inputs(True)
+    try:
+        with pytest.raises(ConstraintError, match="the center is not inside the set"):
+            constraint.alpha_map(obs, action, outside)
+    finally:
+        check_inputs(False)
+
+
+def test_compiled_methods_are_those_of_eager_mode():
+    constraint, obs, action = WeightedL1(lambda obs: obs[..., :2], 1.0, 2), torch.ones(4, 3), 2.0 * torch.ones(4, 2)
+    compiled = torch.compile(constraint.project, backend="eager")
+    for _ in range(3):
+        torch.testing.assert_close(compiled(obs, action), constraint.project(obs, action))
+
+
 def test_checks_ask_nothing_of_a_device():
     """The first calls too may be on a GPU; the meta device has no values to answer with."""
     for name in SETS:

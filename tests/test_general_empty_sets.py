@@ -7,6 +7,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import linprog
 from torch import Tensor
 
 import envs
@@ -216,3 +217,28 @@ def test_an_environment_admits_the_least_violation(project, monkeypatch):
                 env.step(inside)
         env.step(env.constraint.project(obs, torch.from_numpy(inside)).numpy())
         assert env.largest_violation == pytest.approx(0.1, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_rows_of_small_integers(seed):
+    """Rows that vanish, are parallel or meet in one point, with ties everywhere, against SciPy's linear programs."""
+    generator = torch.Generator().manual_seed(seed)
+    dim, rows = 1 + seed % 5, 1 + (5 * seed) % 11
+    A = torch.randint(-2, 3, (8, rows, dim), generator=generator).double()
+    b = torch.randint(-(seed % 2), 4, (8, rows), generator=generator).double() / 2.0
+    action = torch.randint(-2, 3, (8, dim), generator=generator).double() / 2.0
+    constraint = LinearConstraint(dim, lambda obs: A, lambda obs: b, on_empty="least")
+    obs = torch.zeros(8, 1, dtype=torch.float64)
+    least = constraint.least_violation(obs)
+    for name, call in methods(constraint, obs, action).items():
+        assert (constraint.violation(obs, call()) <= least + 1e-6).all(), name
+    extreme = constraint.linear_oracle(obs, action)
+    norm = A.norm(dim=-1)
+    unit, limit = A / torch.where(norm > 0.0, norm, 1.0).unsqueeze(-1), b / torch.where(norm > 0.0, norm, 1.0)
+    for k in range(8):
+        sides = torch.cat((unit[k], torch.full((rows, 1), -1.0)), -1).numpy()
+        expected = linprog([0.0] * dim + [1.0], sides, limit[k].numpy(), bounds=[(-1, 1)] * dim + [(0, None)]).fun
+        assert abs(least[k].item() - expected) <= 1e-8
+        if expected < 1e-9:
+            best = -linprog(-action[k].numpy(), A[k].numpy(), b[k].numpy(), bounds=(-1, 1)).fun
+            assert abs((action[k] @ extreme[k]).item() - best) <= 1e-6

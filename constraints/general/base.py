@@ -110,7 +110,7 @@ class GeneralConstraint(Constraint):
         # No centre is inside a set that is empty; it may be inside what stands for the set.
         self._refuse_derivatives(at, "where the set is empty")
         lead = tuple(direction.shape[:-1])
-        sets = widened(scale_sets(at.written, lead, check=False))
+        sets = widened(scale_sets(at.written, lead, check=False), flat=True)
         middle = torch.zeros_like(direction) if center is None else center
         require(sets.depth(middle.reshape(-1, self.dim).cpu()) > 0.0, "the centre is not interior", sets.name)
         along, offset = direction.reshape(-1, 1, self.dim).cpu(), middle.reshape(-1, 1, self.dim).cpu()
@@ -181,10 +181,15 @@ class GeneralConstraint(Constraint):
                 return center
             return guess
 
-        return self._solve(at, at.lead, solve)[1].view(*at.lead, self.dim).to(at.obs.device)
+        return self._solve(at, at.lead, solve, interior=True)[1].view(*at.lead, self.dim).to(at.obs.device)
 
-    def _solve(self, at: At, lead: tuple[int, ...], solve: Callable[[ScaledSets], Result]) -> tuple[ScaledSets, Result]:
-        """The sets of a batch of shape `lead`, and what `solve` makes of them, in what stands for empty ones."""
+    def _solve(
+        self, at: At, lead: tuple[int, ...], solve: Callable[[ScaledSets], Result], interior: bool = False
+    ) -> tuple[ScaledSets, Result]:
+        """The sets of a batch of shape `lead`, and what `solve` makes of them or of what stands for empty ones.
+
+        `interior`: whether it needs an interior on rows; with ellipses it always may.
+        """
         try:
             sets = scale_sets(at.written, lead)
             return sets, solve(sets)
@@ -192,7 +197,8 @@ class GeneralConstraint(Constraint):
             if self.on_empty != "least":
                 raise
         self._refuse_derivatives(at, "where the set is empty")
-        sets = widened(scale_sets(at.written, lead, check=False))
+        sets = scale_sets(at.written, lead, check=False)
+        sets = widened(sets, flat=interior or sets.curved)
         return sets, solve(sets)
 
     def _finite(self, vector: Tensor) -> tuple[Tensor, Tensor]:

@@ -21,6 +21,8 @@ _DEEP = 0.9
 _SHALLOW = 1e-2
 # The depth of the interior that `widened` gives to sets without one; single precision can tell it from 0.
 _ROOM = 5e-7
+# The rounding of the least violation, where that is large.
+_SHARE = 1e-12
 # The interior-point method's accuracy: deep enough below NO_INTERIOR to tell a thin set from a flat one.
 _ACCURACY = 1e-12
 
@@ -157,13 +159,16 @@ def least_excess(sets: ScaledSets) -> Tensor:
     return excess
 
 
-def widened(sets: ScaledSets) -> ScaledSets:
-    """The sets with rows and ellipses, not the box, moved outwards by the same distance where they are empty or flat.
+def widened(sets: ScaledSets, flat: bool) -> ScaledSets:
+    """The sets with rows and ellipses, not the box, moved outwards by the same distance where they are empty.
 
-    The distance is the least with which a set has an interior of the depth `_ROOM`: its points violate the constraint
-    by no more than the least possible violation and `_ROOM`. A row 0 <= b < 0 is left out, as no action meets it.
+    With `flat`, also where they have no interior. The distance is the least with which a set has an interior of the
+    depth `_ROOM`: its points violate the constraint by no more than the least possible violation and `_ROOM`. A row
+    0 <= b < 0 is left out, as no action meets it.
     """
-    growth = (least_excess(sets) + _ROOM).clamp(min=0.0).unsqueeze(-1)
+    excess = least_excess(sets)
+    growth = torch.where(excess > (-_ROOM if flat else NO_INTERIOR), excess * (1.0 + _SHARE) + _ROOM, 0.0)
+    growth = growth.unsqueeze(-1)
     bounds = torch.where(sets.solid, sets.bounds, 1.0) + growth * sets.given
     factor = (1.0 + growth / sets.root).square()
     return replace(sets, bounds=bounds, matrix=sets.matrix / factor[..., None, None], root=sets.root + growth)

@@ -15,9 +15,9 @@ from pathlib import Path
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 import gymnasium
-import matplotlib
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from constraints import InUnits, LinearConstraint
@@ -84,9 +84,6 @@ def train(limited: bool, steps: int) -> Record:
 
 
 def draw(records: dict[str, Record], path: Path) -> None:
-    matplotlib.use("Agg")
-    from matplotlib.figure import Figure
-
     figure = Figure((8, 3), layout="constrained")
     left, right = figure.subplots(1, 2)
     for (name, record), color in zip(records.items(), ("#1b6f3a", "#999999"), strict=True):
@@ -97,9 +94,9 @@ def draw(records: dict[str, Record], path: Path) -> None:
     left.axhline(LIMIT, color="#c8503c", linestyle="dashed", linewidth=1.0)
     left.set(xlabel="episode of the training", ylabel="largest speed (rad/s)", ylim=(0, None))
     right.set(xlabel="episode of the training", ylabel="return")
-    right.legend(frameon=False)
     plain(left)
     plain(right)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
     figure.savefig(path, dpi=150)
 
 

@@ -12,6 +12,7 @@ parameters of learned coefficients exist as well; they take more time, and only 
 
 from __future__ import annotations
 
+import operator
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from constraints.errors import name_samples, require
 from constraints.gauge import box_gauge_gradient, largest_gauge
 from constraints.implicit import Boundary, Solver, differentiable_projection, tensors_of
 from constraints.jacobian import JacobianProduct, with_jacobian
-from constraints.numerics import is_traced, keep_nan, one_where_zero, with_gradient
+from constraints.numerics import is_traced, keep_nan, one_where_zero, refuse_transforms, with_gradient
 from constraints.ray import Ray
 from constraints.sample import hit_and_run
 
@@ -49,7 +50,7 @@ class ExplicitSet(NamedTuple):
 
 
 class Constraint(ABC):
-    """A feasible set A(obs) inside the box [-1, 1]^dim. ValueError for dim < 1.
+    """A feasible set A(obs) inside the box [-1, 1]^dim. ValueError for dim < 1, TypeError where it is not whole.
 
     A subclass implements the protected methods. They receive float64 tensors; `action` (or `direction`, `gradient`)
     has the common leading shape already. `at` is what `_at(obs)` returned: the observation, if that is not overridden.
@@ -65,7 +66,7 @@ class Constraint(ABC):
     def __init__(self, dim: int):
         if dim < 1:
             raise ValueError(f"dim must be at least 1, got {dim}")
-        self.dim = dim
+        self.dim = operator.index(dim)
         self._center_calls = FirstCalls()
 
     # ---------------------------------------------------------------- what a subclass gives
@@ -119,9 +120,9 @@ class Constraint(ABC):
         """The paper's penalty (...), with finite gradients everywhere. A set with several rows overrides this."""
         return self._violation(at, action).clamp(min=0.0)
 
-    def _center(self, at: Any) -> Tensor | None:
-        """Interior point (..., d), or a single one (d,) for every obs; None for the origin."""
-        return None
+    def _center(self, at: Any) -> Tensor:
+        """Interior point (..., d), or a single one (d,) for every obs. A set with `origin_centered` has none."""
+        raise NotImplementedError(f"{type(self).__name__} needs _center, or origin_centered = True")
 
     def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
         """Points (..., count, d), uniform in the set. A set with a closed form overrides this."""
@@ -189,9 +190,9 @@ class Constraint(ABC):
         check_tensor("obs", obs)
         if not obs.is_floating_point():
             raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
-        center = self._center(self._at(obs.double()))
-        if center is None:
+        if self.origin_centered:
             return obs.new_zeros(*obs.shape[:-1], self.dim)
+        center = self._center(self._at(obs.double()))
         return center.expand(*obs.shape[:-1], self.dim).to(obs.dtype)
 
     def gauge(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
@@ -218,7 +219,10 @@ class Constraint(ABC):
         """
         obs64, action64 = self._broadcast(obs, action)
         at = self._at(obs64)
-        center64 = self._center(at) if center is None else self._given_center(at, center)
+        if center is None:
+            center64 = None if self.origin_centered else self._center(at)
+        else:
+            center64 = self._given_center(at, center)
         offset = action64 if center64 is None else action64 - center64
         traced = is_traced(center64, *tensors_of(at))
         return Ray(
@@ -264,6 +268,7 @@ class Constraint(ABC):
         It is a constant, without gradients. RuntimeError where the observation or learned coefficients ask for them.
         """
         check_tensor("gradient", gradient)
+        refuse_transforms("linear_oracle")
         obs64, gradient64 = self._broadcast(obs, gradient.detach())
         at = self._at(obs64)
         if torch.is_grad_enabled() and any(value.requires_grad for value in tensors_of(at)):
@@ -325,5 +330,10 @@ class Constraint(ABC):
             raise TypeError(f"expected float32 or float64 actions, got {action.dtype}")
         obs, action = obs.double(), action.double()
         if obs.shape[:-1] != action.shape[:-1]:
-            action = action.expand(*torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1]), self.dim)
+            try:
+                lead = torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1])
+            except RuntimeError:
+                shapes = f"{tuple(obs.shape)} and {tuple(action.shape)}"
+                raise ValueError(f"leading shapes of obs and action do not broadcast: {shapes}") from None
+            action = action.expand(*lead, self.dim)
         return obs, action

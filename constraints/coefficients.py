@@ -6,12 +6,13 @@ them checked always.
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Callable
 
 from torch import Tensor
 
-from constraints.checks import checked
-from constraints.errors import check_bound, name_samples, require
+from constraints.checks import check_tensor, checked
+from constraints.errors import ConstraintError, check_bound, name_samples, require
 from constraints.numerics import is_transformed
 
 Coefficients = Callable[[Tensor], Tensor]
@@ -79,6 +80,9 @@ class Coefficient:
         return values.double()
 
     def _checked(self, values: Tensor, obs: Tensor) -> Tensor:
+        check_tensor(self._what, values)
+        if values.is_complex():
+            raise ConstraintError(f"{self._what} is complex")
         look = self._calls.readable(obs) and bool(obs.isfinite().all())
         values = checked(values, self._what, self._shape, obs, finite=look)
         if look and self._check is not None:
@@ -94,8 +98,8 @@ class BoundCoefficient:
         if callable(bound):
             self._values = Coefficient(what, bound, (), check_positive)
         else:
-            if isinstance(bound, Tensor):
-                raise TypeError(f"{what} must be a number or a function of the observation, got a tensor")
+            if not isinstance(bound, numbers.Real):
+                raise TypeError(f"{what} must be a number or a function of the observation, got {type(bound).__name__}")
             check_bound(bound)
             self._number = float(bound)
 

@@ -37,6 +37,12 @@ def is_transformed() -> bool:
     return torch._C._are_functorch_transforms_active()
 
 
+def refuse_transforms(what: str) -> None:
+    """Raise a RuntimeError where a transform of torch.func is at work."""
+    if is_transformed():
+        raise RuntimeError(f"{what} has no torch.func transforms; it takes batches of any leading shape as it is")
+
+
 def is_traced(*values: object) -> bool:
     """Whether autograd records what is done with one of the values, or a transform of torch.func is at work."""
     return is_transformed() or (

@@ -22,7 +22,7 @@ from constraints.jacobian import JacobianProduct, deflated_jacobian
 from constraints.numerics import one_where_zero, root_or_one, safe_sqrt
 from constraints.scalar_dual import RowProblem
 
-_TINY = 1e-300  # a divisor in the place of 0
+_TINY = 1e-300  # the square of a divisor in the place of 0
 _MOST_WRITTEN = 16  # coordinates of a set whose 2^d rows are written out
 _MOST_COMPARED = 12  # the same where all rows are compared with each other at every action
 
@@ -172,8 +172,9 @@ class WeightedPositivePart(_WeightPatterns):
         # attain it; this one is continuous in obs.
         weight, bound = at
         ordered = weight.abs().sort(-1, descending=True).values
-        total, norm = ordered.cumsum(-1), safe_sqrt(ordered.square().cumsum(-1))
-        radius = ((bound + total) / (norm + total).clamp(min=_TINY)).amin(-1, keepdim=True).clamp(max=1.0)
+        # Without weights, the quotient is large: the radius is the box's.
+        total, norm = ordered.cumsum(-1), ordered.square().cumsum(-1).clamp(min=_TINY).sqrt()
+        radius = ((bound + total) / (norm + total)).amin(-1, keepdim=True).clamp(max=1.0)
         room = 1.0 - radius
         return -(radius**2 * weight / (2.0 * bound)).clamp(-room, room)
 

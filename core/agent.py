@@ -247,8 +247,11 @@ class Agent(Snapshots):
     def diverged(self) -> dict[int, str]:
         """The positions of the seeds with a loss that is not finite, and which. It waits for the device."""
         found: dict[int, str] = {}
+        sums = [losses.sum() for losses in self.losses.values()]
+        if not sums or math.isfinite(torch.stack(sums).sum().item()):  # the common case waits once
+            return found
         for name, losses in self.losses.items():
-            if not math.isfinite(losses.sum().item()):  # the common case costs little
+            if not math.isfinite(losses.sum().item()):
                 finite = losses.isfinite().reshape(-1, len(self.seeds)).all(0)
                 for i in (~finite).nonzero().flatten().tolist():
                     found.setdefault(i, f"{name} loss")

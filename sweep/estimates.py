@@ -113,7 +113,8 @@ def corrections(runs: Iterable[Run], device: str) -> dict[tuple[str, str], float
         if run.result is None or run.task not in TASKS or run.algo not in ALGORITHMS:
             continue
         try:
-            config = saved_config(run.config | {"env": run.task, "algo": run.algo})
+            # (runs that are older than the choice of a device were on the CPU)
+            config = saved_config({"device": "cpu"} | run.config | {"env": run.task, "algo": run.algo})
             took, seeds = float(run.result["seconds"]["total"]), int(run.result["seeds_in_lockstep"])
             steps = int(run.result["gradient_steps"])
         except (KeyError, TypeError, ValueError):

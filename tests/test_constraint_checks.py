@@ -97,7 +97,7 @@ def test_bounds_that_are_no_positive_numbers(bound):
 
 def test_a_bound_may_not_be_a_tensor():
     """It would lose its gradient, and it does not say which observation it belongs to."""
-    with pytest.raises(TypeError, match="bound must be a number or a function of the observation, got a tensor"):
+    with pytest.raises(TypeError, match="bound must be a number or a function of the observation, got Tensor"):
         Ball(torch.tensor(0.5, requires_grad=True), 2)
     with pytest.raises(TypeError, match="weight must be a function of the observation, got list"):
         WeightedL1([1.0, 2.0], 1.0, 2)
@@ -193,6 +193,22 @@ def test_arrays_and_lists_are_refused_by_name():
             constraint.alpha_map(obs, action, wrong)
     with pytest.raises(ValueError, match=r"expected 2 action coordinates, got shape \(\)"):
         constraint.project(obs, torch.tensor(0.5))
+
+
+def test_arguments_that_are_of_another_kind():
+    obs, action = torch.zeros(4, 3), torch.ones(4, 2)
+    for wrong, kind in ([1.0, 2.0], "list"), (np.ones(2), "ndarray"), (None, "NoneType"), ("x", "str"):
+        with pytest.raises(TypeError, match=rf"weight\(obs\) must be a torch.Tensor, got {kind}"):
+            WeightedL1(lambda obs, wrong=wrong: wrong, 1.0, 2).project(obs, action)
+        with pytest.raises(TypeError, match=f"bound must be a number or a function of the observation, got {kind}"):
+            Ball(wrong, 2)
+    with pytest.raises(ConstraintError, match=r"weight\(obs\) is complex"):
+        WeightedL1(lambda obs: torch.ones(2, dtype=torch.complex64), 1.0, 2).project(obs, action)
+    with pytest.raises(TypeError, match="integer"):
+        Ball(0.5, 2.0)
+    with pytest.raises(ValueError, match=r"leading shapes of obs and action do not broadcast: \(5, 3\) and \(4, 2\)"):
+        Ball(0.5, 2).project(torch.zeros(5, 3), action)
+    assert Ball(np.float32(0.5), np.int64(2)).project(obs, action).shape == (4, 2)
 
 
 def test_contains():

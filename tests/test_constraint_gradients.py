@@ -301,6 +301,18 @@ def test_jacrev(name):
                 torch.testing.assert_close(alone, expected, msg=f"{method}, argument {argument}")
 
 
+def test_what_has_no_transforms_says_so():
+    constraint, obs, action = with_fixed_sets("ellipse")
+    std = torch.ones_like(action)
+    for function, what in (
+        (constraint.linear_oracle, "linear_oracle"),
+        (lambda o, a: constraint.radial_log_prob(o, a, a.sum(-1)), "the density of the radial map"),
+        (lambda o, a: constraint.alpha_log_prob(o, a, a, std[0]), "the density of the alpha map"),
+    ):
+        with pytest.raises(RuntimeError, match=f"{what} has no torch.func transforms"):
+            torch.func.vmap(function)(obs, action)
+
+
 def test_vmap_of_general_sets():
     constraint = general(torch.ones((), dtype=torch.float64))["intersection"]
     obs, action = torch.rand(4, 3, dtype=torch.float64), torch.rand(4, 2, dtype=torch.float64)

@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from helpers import cells_of, config_of
+from helpers import CHECKPOINTED, Breaks, cells_of, config_of, train
 
 import sweep.train
 from core.config import THREADS
+from store.interrupt import Interrupted
 from sweep.launch import launch
 from sweep.settings import parse_sweep
 
@@ -90,3 +91,14 @@ def test_the_launcher_chooses_for_the_cells_of_a_sweep(words, device, threads, g
     launch(settings, cells_of([f"{key}={value}" for key, value in rest.items()]), lambda: None)
     assert [(cell.config.device, cell.config.threads) for cell in planned] == [(device, threads)] * 2
     assert all(f"device={device}" in cell.words and f"threads={threads}" in cell.words for cell in planned)
+
+
+def test_a_run_that_resumes_on_another_device_says_so(tmp_path, capsys, monkeypatch):
+    saved = sweep.train.saved_settings
+    monkeypatch.setattr(sweep.train, "saved_settings", lambda config, seed: saved(config, seed) | {"device": "cuda"})
+    with pytest.raises(Interrupted):
+        train(tmp_path, CHECKPOINTED, Breaks(40))
+    monkeypatch.setattr(sweep.train, "saved_settings", saved)
+    capsys.readouterr()
+    assert train(tmp_path, f"{CHECKPOINTED} device=cpu")
+    assert "(device=cpu now, cuda before: equal up to rounding to an unbroken run)" in capsys.readouterr().out

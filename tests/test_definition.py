@@ -126,6 +126,17 @@ def test_what_differs_is_said(before, now, said):
     assert differences(describe({"value": before}), describe({"value": before})) == ""
 
 
+def test_a_definition_does_not_depend_on_what_was_done_with_it():
+    values = [*(TASKS[name].constraint for name in ("R+M", "R+T", "H+O+S")), Rows(torch.eye(2)), l1(scaled(2.0))]
+    values.append(Intersection(Ball(0.5, 2), Rows(torch.eye(2))))
+    for value in values:
+        before = describe({"value": value})
+        obs = torch.randn(4, 17)
+        for method in (value.project, value.linear_oracle, value.violation, value.alpha_map):
+            method(obs, torch.randn(4, value.dim))
+        assert differences(before, describe({"value": value})) == ""
+
+
 def test_globals_count(monkeypatch):
     before = describe({"value": uses_a_global})
     assert differences(before, describe({"value": uses_a_global})) == ""

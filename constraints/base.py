@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import operator
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from constraints.checks import ON_BOUNDARY, check_tensor
+from constraints.checks import ON_BOUNDARY, check_observation, check_tensor
 from constraints.coefficients import FirstCalls
 from constraints.errors import name_samples, require
 from constraints.gauge import box_gauge_gradient, largest_gauge
@@ -29,6 +29,7 @@ from constraints.numerics import is_traced, keep_nan, one_where_zero, refuse_tra
 from constraints.ray import Ray
 from constraints.sample import hit_and_run
 
+OnEmpty = Literal["error", "least"]
 AT_FACE = 1.0 - 1e-9
 """The box holds a coordinate of a projection that is at least this large: rounding may have moved it off the face."""
 
@@ -58,7 +59,7 @@ class Constraint(ABC):
 
     origin_centered: bool = True
     """True where `center(obs)` is the origin for every obs, so that no centre needs to be stored."""
-    on_empty: str = "error"
+    on_empty: OnEmpty = "error"
     """What happens where no action meets the constraint, "error" or "least"; see `GeneralConstraint`."""
     solved_on_cpu: bool = False
     """True where a solver runs on the CPU, so that a GPU has to wait. No CUDA graph can hold such a set."""
@@ -179,6 +180,7 @@ class Constraint(ABC):
 
     def least_violation(self, obs: Tensor) -> Tensor:
         """The least violation (...) that an action in the box can have, at obs (..., n); 0 if the set has one."""
+        check_observation(obs)
         return obs.new_zeros(obs.shape[:-1])  # closed forms contain the origin
 
     def center(self, obs: Tensor) -> Tensor:
@@ -187,9 +189,7 @@ class Constraint(ABC):
         It is the Chebyshev centre of a linear set, the ellipse's centre otherwise, the origin where both are present.
         The classes of sets of one's own say what theirs is.
         """
-        check_tensor("obs", obs)
-        if not obs.is_floating_point():
-            raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
+        check_observation(obs)
         if self.origin_centered:
             return obs.new_zeros(*obs.shape[:-1], self.dim)
         center = self._center(self._at(obs.double()))
@@ -284,8 +284,7 @@ class Constraint(ABC):
         """
         if count < 1:
             raise ValueError(f"count must be at least 1, got {count}")
-        if not obs.is_floating_point():
-            raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
+        check_observation(obs)
         with torch.no_grad():
             return self._sample(obs.detach().double(), count, generator).to(obs.dtype)
 

@@ -21,6 +21,13 @@ def check_tensor(what: str, value: Any) -> None:
         raise TypeError(f"{what} must be a torch.Tensor, got {type(value).__name__}; torch.as_tensor({what}) makes one")
 
 
+def check_observation(obs: Any) -> None:
+    """Raise a TypeError for what is not a tensor of floating-point numbers. Results get the dtype of `obs`."""
+    check_tensor("obs", obs)
+    if not obs.is_floating_point():
+        raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
+
+
 def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tensor, finite: bool = True) -> Tensor:
     """Coefficients as float64 (*lead, *shape), finite and of the expected shape, or a ConstraintError.
 

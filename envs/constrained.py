@@ -12,13 +12,16 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from torch import Tensor
 
+from constraints import Constraint
 from core.words import known_name
 from envs.drawing import draw_set
 from envs.registry import TASKS, Task
 from envs.robot import Robot, Step, UnavailableError
 
-TOLERANCE = 1e-6  # largest violation an executed action may have, in the units of `Constraint.violation`
+TOLERANCE = 1e-6
+"""Largest violation that an executed action may have, in the units of `Constraint.violation`."""
 
 Outcome = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
 """What `step` of an environment returns: observation (n,), reward, terminated, truncated, info."""
@@ -26,6 +29,16 @@ Outcome = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
 
 class InfeasibleActionError(ValueError):
     """An action lies outside the task's feasible set at the current observation, or is no action at all."""
+
+
+def allowed_violation(constraint: Constraint, obs: Tensor) -> Tensor:
+    """The largest violations (...) that actions executed at obs (..., n) may have.
+
+    It is TOLERANCE and, for a constraint with `on_empty="least"`, the least violation that is possible there.
+    """
+    if constraint.on_empty != "least":
+        return obs.new_full(obs.shape[:-1], TOLERANCE)
+    return TOLERANCE + constraint.least_violation(obs)
 
 
 def find_task(name: str) -> Task:
@@ -307,8 +320,8 @@ class ActionConstrainedEnv(gymnasium.Env):
             exact = self.constraint.project(obs, exact)
             action, violation = exact.numpy(), self.constraint.violation(obs, exact).item()
         allowed = TOLERANCE
-        if violation > TOLERANCE and self.constraint.on_empty == "least":
-            allowed += self.constraint.least_violation(torch.from_numpy(self._obs)).item()
+        if violation > TOLERANCE:
+            allowed = allowed_violation(self.constraint, torch.from_numpy(self._obs)).item()
         if not violation <= allowed:  # a NaN is refused as well
             return InfeasibleActionError(
                 f"{self._where()}: action {action} violates the constraint by {violation:.3g} "

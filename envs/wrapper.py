@@ -12,7 +12,7 @@ from torch import Tensor
 
 from constraints import Constraint
 from core.words import known_name
-from envs.constrained import TOLERANCE, InfeasibleActionError
+from envs.constrained import TOLERANCE, InfeasibleActionError, allowed_violation
 
 MAPPINGS: dict[str, Callable[[Constraint, Tensor, Tensor], Tensor]] = {
     "project": lambda constraint, obs, action: constraint.project(obs, action),
@@ -55,7 +55,7 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     (d,), for a constraint of another dimension, and for observations that need `features`. `step` raises
     InfeasibleActionError, a ValueError too, for an action of another shape and for one that is not finite; also if a
     mapped action violates the constraint by more than 1e-6, which shows that the constraint or the observation is
-    wrong.
+    wrong. Where a set with `on_empty="least"` is empty, the least possible violation is allowed as well.
     """
 
     def __init__(
@@ -111,15 +111,15 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         action = torch.from_numpy(suggested)
         violation = self._violation(action)
         if self.mapping is None:
-            if not violation <= TOLERANCE:
-                raise InfeasibleActionError(f"action {suggested} {_excess(violation)}")
+            if refused := self._refusal(violation):
+                raise InfeasibleActionError(f"action {suggested} {refused}")
             return suggested.copy(), violation
         if self.mapping in KEEP_FEASIBLE and violation <= 0.0:
             return suggested.copy(), violation
         mapped = MAPPINGS[self.mapping](self.constraint, self._obs, action)
-        if not (left := self._violation(mapped)) <= TOLERANCE:  # a NaN is refused as well
+        if refused := self._refusal(self._violation(mapped)):
             raise InfeasibleActionError(
-                f"{self.mapping} maps {suggested} to {mapped.numpy()}, which {_excess(left)}; the constraint does not"
+                f"{self.mapping} maps {suggested} to {mapped.numpy()}, which {refused}; the constraint does not"
                 f" work at the observation {self._obs.numpy()}"
             )
         return mapped.numpy(), violation
@@ -127,16 +127,21 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     def _violation(self, action: Tensor) -> float:
         return self.constraint.violation(self._obs, action).item()
 
+    def _refusal(self, violation: float) -> str | None:
+        """Why an action with this violation is refused; None where it is not."""
+        allowed = TOLERANCE
+        if violation > TOLERANCE:
+            allowed = allowed_violation(self.constraint, self._obs).item()
+        if violation <= allowed:  # not of a NaN
+            return None
+        return f"violates the constraint by {violation:.3g} (at most {allowed:.3g} is allowed)"
+
     def _see(self, obs: Any) -> None:
         """Keep a copy of what the constraint sees of an observation: environments may write into theirs."""
         seen = np.array(obs if self.features is None else self.features(obs), np.float64)
         if seen.ndim != 1:
             raise ValueError(f"features() must return an array (n,), got shape {seen.shape}")
         self._obs = torch.from_numpy(seen)
-
-
-def _excess(violation: float) -> str:
-    return f"violates the constraint by {violation:.3g} (at most {TOLERANCE:g} is allowed)"
 
 
 def _checked_box(space: gymnasium.Space, dim: int) -> gymnasium.spaces.Box:

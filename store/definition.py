@@ -220,7 +220,8 @@ class _Describer:
         elif isinstance(item, (type, types.FunctionType)):
             if is_user(inspect.unwrap(item)):
                 self.add(path, item)
-        elif not (isinstance(item, types.BuiltinFunctionType) or _is_projects(item)):
+        elif isinstance(item, _PLAIN) or not (isinstance(item, types.BuiltinFunctionType) or _is_projects(item)):
+            # Python has one object for equal small numbers and short texts, so that the project may have it as well.
             self.add(path, item)
 
 

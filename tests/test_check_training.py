@@ -13,6 +13,7 @@ from constraints import Ball, LinearConstraint
 from core.maps import Map, Radial
 from envs import TASKS, Task
 from envs.reacher import Reacher
+from store.folder import read_results
 
 WORDS = "env=R+X steps=20 learning_starts=10 batch_size=4 hidden=[8] eval_every=20 eval_episodes=1 final_episodes=1"
 
@@ -104,6 +105,16 @@ def test_a_method_of_the_constraint_that_the_run_will_use(tmp_path, monkeypatch,
     assert run_command([f"algo={algo}", *WORDS.split(), f"results={tmp_path}"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("algo", ["DPro", "DRad", "SPre"])
+def test_the_least_violation_at_the_start_is_no_mistake(tmp_path, monkeypatch, algo):
+    rows, bounds = torch.tensor([[1.0, 0.0], [-1.0, 0.0]]).double(), torch.full((2,), -0.5).double()
+    constraint = LinearConstraint(2, lambda obs: rows, lambda obs: bounds, on_empty="least")
+    monkeypatch.setitem(TASKS, "R+X", Task(Reacher, constraint, "", "", 20))
+    assert run_command([f"algo={algo}", *WORDS.split(), f"results={tmp_path}"]) == 0
+    (run,) = read_results(tmp_path)[0]
+    assert run.result["largest_violation"] == pytest.approx(0.5, abs=2e-6)
 
 
 @pytest.mark.parametrize("algo", ["DPre", "DRad"])

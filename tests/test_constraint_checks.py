@@ -208,8 +208,9 @@ def test_arrays_and_lists_are_refused_by_name():
                 getattr(constraint, method)(wrong, action)
             with pytest.raises(TypeError, match=f"(action|gradient) must be a torch.Tensor, got {kind}"):
                 getattr(constraint, method)(obs, wrong)
-        with pytest.raises(TypeError, match=f"obs must be a torch.Tensor, got {kind}"):
-            constraint.center(wrong)
+        for call in (constraint.center, constraint.least_violation, lambda obs: constraint.sample(obs, 1)):
+            with pytest.raises(TypeError, match=f"obs must be a torch.Tensor, got {kind}"):
+                call(wrong)
         with pytest.raises(TypeError, match=f"center must be a torch.Tensor, got {kind}"):
             constraint.alpha_map(obs, action, wrong)
     with pytest.raises(ValueError, match=r"expected 2 action coordinates, got shape \(\)"):

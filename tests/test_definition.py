@@ -24,6 +24,7 @@ from sweep.definition import define
 ROOT = Path(__file__).parents[1]
 WORDS = CHECKPOINTED.replace("env=R+N", "env=R+X")
 SCALE = 2.0
+SHARED = 2  # Python has one such number, so that it is also one of the project's
 
 
 def task(constraint, robot=Reacher):
@@ -40,6 +41,10 @@ def times(obs, factor):
 
 def uses_a_global(obs):
     return times(obs, SCALE)
+
+
+def uses_a_small_number(obs):
+    return times(obs, SHARED)
 
 
 class Rows(LinearConstraint):
@@ -142,6 +147,14 @@ def test_globals_count(monkeypatch):
     assert differences(before, describe({"value": uses_a_global})) == ""
     monkeypatch.setitem(globals(), "SCALE", 3.0)
     assert differences(before, describe({"value": uses_a_global})) == "the value's SCALE: 2.0 then, 3.0 now"
+
+
+@pytest.mark.parametrize("value", [3, True, None, "algo"])
+def test_globals_count_that_are_the_same_object_in_the_project(monkeypatch, value):
+    before = describe({"value": uses_a_small_number})
+    monkeypatch.setitem(globals(), "SHARED", value)
+    said = differences(before, describe({"value": uses_a_small_number}))
+    assert said == f"the value's SHARED: 2 then, {value if value == 'algo' else repr(value)} now"
 
 
 def test_a_function_that_a_function_calls_counts(monkeypatch):

@@ -379,3 +379,23 @@ def test_an_empty_set_is_reported_by_the_step():
     env.reset()
     with pytest.raises(ConstraintError, match="the only sample"):
         env.step(np.zeros(2))
+
+
+@pytest.mark.parametrize("mapping", ["project", "alpha", "gauge", None])
+def test_the_least_violation_is_executed_where_the_constraint_says_so(mapping):
+    def two_rows(obs):
+        return torch.tensor([[1.0, 0.0], [-1.0, 0.0]], dtype=torch.float64)
+
+    apart = LinearConstraint(2, two_rows, lambda obs: torch.full((2,), -0.5).double(), on_empty="least")
+    in_units = InUnits(
+        LinearConstraint(2, two_rows, lambda obs: torch.full((2,), -1.0).double(), on_empty="least"), -2, 2
+    )
+    for constraint in (apart, in_units):  # the same set: -0.5 >= a_1 >= 0.5
+        env = Constrained(Robot(), constraint, mapping)
+        env.reset()
+        info = env.step(np.array([0.0, 0.3]))[4]
+        assert info["executed_action"][0] == pytest.approx(0.0, abs=1e-6)
+        assert info["violation"] == pytest.approx(0.5)
+    if mapping is None:
+        with pytest.raises(InfeasibleActionError, match="at most 0.5"):
+            env.step(np.array([0.2, 0.3]))

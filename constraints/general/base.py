@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import cached_property
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from constraints.base import Constraint, ExplicitSet
-from constraints.checks import ON_BOUNDARY
+from constraints.base import Constraint, ExplicitSet, OnEmpty
+from constraints.checks import ON_BOUNDARY, check_observation
 from constraints.ellipse import ellipse_gauge_gradient
 from constraints.errors import ConstraintError, EmptySetError, name_samples, require
 from constraints.general.active_set import project_on_rows
@@ -20,9 +20,8 @@ from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.projection import closest_points, optimal_points
 from constraints.general.scaled_sets import ScaledSets, scale_sets
 from constraints.jacobian import JacobianProduct
-from constraints.numerics import is_traced, times
+from constraints.numerics import is_traced, is_transformed, times
 
-OnEmpty = Literal["error", "least"]
 Result = TypeVar("Result")
 
 
@@ -68,6 +67,7 @@ class GeneralConstraint(Constraint):
 
     @torch.no_grad()
     def least_violation(self, obs: Tensor) -> Tensor:
+        check_observation(obs)
         at = self._coefficients(obs.double())
         sets = scale_sets(at.written, at.lead, check=False)
         # A row 0 <= b is violated by -b wherever one is.
@@ -84,7 +84,7 @@ class GeneralConstraint(Constraint):
 
     def _at(self, obs: Tensor) -> At | Tensor:
         # Transforms of torch.func see the solvers from outside, as one function of the observation.
-        return obs if torch._C._are_functorch_transforms_active() else self._coefficients(obs)
+        return obs if is_transformed() else self._coefficients(obs)
 
     def at(self, at: At | Tensor) -> At:
         """The coefficients, whatever `_at` returned."""

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from constraints.base import ExplicitSet
+from constraints.base import ExplicitSet, OnEmpty
 from constraints.checks import ON_BOUNDARY, checked
 from constraints.errors import name_samples, require
-from constraints.general.base import At, GeneralConstraint, OnEmpty, check_obs
+from constraints.general.base import At, GeneralConstraint, check_obs
 from constraints.general.scaled_sets import unit_rows
 from constraints.numerics import safe_sqrt, times
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from constraints.base import Ellipse, ExplicitSet
+from constraints.base import Ellipse, ExplicitSet, OnEmpty
 from constraints.checks import ON_BOUNDARY, check_semidefinite, checked
 from constraints.ellipse import ellipse_excess, ellipse_gauge_gradient
 from constraints.errors import name_samples, require
-from constraints.general.base import At, GeneralConstraint, OnEmpty, check_obs
+from constraints.general.base import At, GeneralConstraint, check_obs
 from constraints.numerics import times
 
 Coefficient = Callable[[Tensor], Tensor]

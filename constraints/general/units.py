@@ -22,10 +22,11 @@ class InUnits(GeneralConstraint):
     finite or low is not below high.
 
     Violations and penalties are those of the rows and ellipses of a, each scaled as `Constraint.violation` says.
+    `on_empty` is that of `constraint`.
     """
 
     def __init__(self, constraint: Constraint, low: ArrayLike, high: ArrayLike):
-        super().__init__(constraint.dim)
+        super().__init__(constraint.dim, constraint.on_empty)
         least, most = (torch.as_tensor(bound, dtype=torch.float64).reshape(-1) for bound in (low, high))
         if any(len(bound) not in (1, self.dim) for bound in (least, most)):
             raise ValueError(

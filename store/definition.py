@@ -159,7 +159,7 @@ class _Describer:
             public = {name: item for name, item in attributes.items() if not name.startswith("_")}
             attributes = _arguments(value, attributes) or public
         elif not is_user(type(value)):
-            attributes = _library_state(value, attributes)
+            attributes = _library_state(value)
         else:
             kept = _internals(type(value))
             attributes = {name: item for name, item in attributes.items() if name not in kept}
@@ -277,13 +277,14 @@ def _internals(kind: type) -> set[str]:
     return used - {f"_{name}" for name in _parameters(bases)}
 
 
-def _library_state(value: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
+def _library_state(value: Any) -> dict[str, Any]:
     """The parameters of a network; of another library's object the public numbers and texts, as the rest may change."""
     if hasattr(value, "state_dict"):
         return dict(value.state_dict())
+    repr(value)  # some objects keep their text from then on, as Gymnasium's boxes do
     return {
         name: item
-        for name, item in attributes.items()
+        for name, item in _attributes(value).items()
         if not name.startswith("_") and isinstance(item, (*_PLAIN, np.ndarray))
     }
 

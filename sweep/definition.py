@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+
 from algos import ALGORITHMS
 from core.words import ConfigError
 from envs import TASKS
@@ -20,9 +22,14 @@ def define(task: str, algo: str) -> dict[str, Description]:
     robot, algorithm = TASKS[task].robot, ALGORITHMS[algo]
     public = {name: getattr(robot, name) for name in dir(robot) if not name.startswith("_")}
     numbers = {f"robot.{name}": value for name, value in public.items() if isinstance(value, (int, float, str))}
+    simulation = {}
+    if isinstance(spec := getattr(robot, "spec", None), EnvSpec):  # of a GymnasiumRobot, whose code is elsewhere
+        entry = spec.entry_point
+        made_by = load_env_creator(entry) if isinstance(entry, str) else entry
+        simulation = {"environment": made_by, "arguments": spec.kwargs}
     how = {"agent": algorithm.agent, "map": algorithm.map, "placement": algorithm.placement}
     return {
-        "task": describe({"constraint": TASKS[task].constraint, "robot": robot, **numbers}),
+        "task": describe({"constraint": TASKS[task].constraint, "robot": robot, **numbers, **simulation}),
         "algorithm": describe({**how, "penalty": algorithm.penalty}),
     }
 

@@ -6,11 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from helpers import CHECKPOINTED, Breaks, run_command, train
 
+import envs
 import plot
 from algos import ALGORITHMS, Algorithm
 from algos.td3 import TD3
@@ -140,6 +142,12 @@ def test_a_definition_does_not_depend_on_what_was_done_with_it():
         for method in (value.project, value.linear_oracle, value.violation, value.alpha_map):
             method(obs, torch.randn(4, value.dim))
         assert differences(before, describe({"value": value})) == ""
+
+
+def test_a_definition_does_not_depend_on_what_was_printed():
+    space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+    before = describe({"value": space})
+    assert str(space) and differences(before, describe({"value": space})) == ""
 
 
 def test_globals_count(monkeypatch):
@@ -297,6 +305,57 @@ def test_an_algorithm_of_ones_own_has_a_definition_too(tmp_path, capsys, name_al
     name_algorithm(TD3)
     assert run_command(words) == 2
     assert "another definition of its algorithm: the agent" in capsys.readouterr().err
+
+
+GAIN = 2.0
+
+
+class Elsewhere(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-9.0, 9.0, (3,), np.float64)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float64)
+
+    def __init__(self, render_mode=None, factor=1.0):
+        self.factor = factor
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1.0, 1.0, 3), {}
+
+    def step(self, action):
+        return np.append(action, GAIN * self.factor), 0.0, False, False, {}
+
+
+@pytest.fixture
+def register():
+    """The robot of a Gymnasium environment that is registered anew."""
+
+    def give(**arguments):
+        gymnasium.registry.pop("Elsewhere-v0", None)
+        envs.GymnasiumRobot.cache_clear()
+        gymnasium.register("Elsewhere-v0", entry_point=Elsewhere, max_episode_steps=20, kwargs=arguments)
+        return envs.GymnasiumRobot("Elsewhere-v0")
+
+    yield give
+    gymnasium.registry.pop("Elsewhere-v0", None)
+    envs.GymnasiumRobot.cache_clear()
+
+
+def test_the_code_of_a_gymnasium_environment_counts(monkeypatch, define_task, register):
+    define_task(Ball(0.05, 2), register())
+    before = define("R+X", "DPre")["task"]
+    assert not is_own(before)
+    monkeypatch.setitem(globals(), "GAIN", 3.0)
+    assert differences(before, define("R+X", "DPre")["task"]) == "step.GAIN in class Elsewhere: 2.0 then, 3.0 now"
+    monkeypatch.setitem(globals(), "GAIN", 2.0)
+    define_task(Ball(0.05, 2), register(factor=2.0))
+    said = differences(before, define("R+X", "DPre")["task"])
+    assert said == "the arguments[factor]: none then, 2.0 now"
+
+
+def test_a_librarys_gymnasium_environment_is_its_name(define_task):
+    define_task(Ball(0.05, 1), envs.GymnasiumRobot("Pendulum-v1"))
+    task = define("R+X", "DPre")["task"]
+    assert is_own(task) and task["robot.identifier"] == "Pendulum-v1" and task["environment"] == "PendulumEnv"
 
 
 def test_runs_without_a_definition(tmp_path, capsys, define_task):

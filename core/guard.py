@@ -6,7 +6,7 @@ import copy
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 import torch
@@ -15,6 +15,9 @@ from torch import Tensor
 from constraints import Constraint, ConstraintError
 from constraints.ray import Ray
 from core.evaluation import StepTogether, refusal
+
+Rows = Sequence[int] | None
+"""Which row of a batch stands in the place of each; None where each is itself."""
 
 
 class Guard:
@@ -29,10 +32,7 @@ class Guard:
     def __init__(self, constraint: Constraint, seeds: int):
         self.positions: Sequence[int] = range(seeds)  # of the seeds on the first axis
         self.refused: dict[int, str] = {}
-        self.constraint = copy.copy(constraint)
-        for name, function in inspect.getmembers(type(constraint), inspect.isfunction):
-            if not name.startswith("_") and "obs" in inspect.signature(function).parameters:
-                setattr(self.constraint, name, self._guarded(getattr(constraint, name)))
+        self.constraint = replace_methods(constraint, self._guarded)
 
     @contextmanager
     def of(self, which: Sequence[int]) -> Iterator[dict[int, str]]:
@@ -61,49 +61,43 @@ class Guard:
 
         return act
 
-    def _guarded(self, method: Callable) -> Callable:
+    def _guarded(self, name: str, method: Callable) -> Callable:
         @wraps(method)
         def guarded(*args: Any, **kwargs: Any) -> Any:
-            result, rows = self._call(method, args, kwargs)
-            if isinstance(result, Ray):
-                result._gauge_of = self._guarded_gauge(result, rows, method, args, kwargs)
+            obs = kwargs["obs"] if "obs" in kwargs else args[0]
+
+            def call(rows: Rows) -> Any:
+                return method(*args, **kwargs) if rows is None else _call_with(rows, method, args, kwargs)
+
+            result, rows = self._attempt(obs, call)
+            if isinstance(result, Ray):  # which asks for its gauge later
+                gauge_of = result._gauge_of
+
+                def gauge(direction: Tensor, now: Rows) -> tuple[Tensor, Tensor]:
+                    return (gauge_of if now == rows else call(now)._gauge_of)(direction)
+
+                result._gauge_of = lambda direction: self._attempt(obs, partial(gauge, direction))[0]
             return result
 
         return guarded
 
-    def _guarded_gauge(self, ray: Ray, rows: Sequence[int], method: Callable, args: tuple, kwargs: dict) -> Callable:
-        """A ray asks for its gauge later. This guards that as well."""
-        gauge_of = ray._gauge_of
-
-        def guarded(direction: Tensor) -> tuple[Tensor, Tensor]:
-            ask, stand_in = gauge_of, rows
-            while True:
-                try:
-                    return ask(direction)
-                except ConstraintError as error:
-                    self._refuse(error, _arguments(method, args, kwargs).arguments["obs"], stand_in)
-                    again, stand_in = self._call(method, args, kwargs)
-                    ask = again._gauge_of
-
-        return guarded
-
-    def _call(self, method: Callable, args: tuple, kwargs: dict[str, Any]) -> tuple[Any, Sequence[int]]:
-        """The result of `method`, and which rows' observations and centres have stood in the place of each row's."""
+    def _attempt(self, obs: Tensor, call: Callable[[Rows], Any]) -> tuple[Any, Rows]:
+        """The result of `call` for the rows that may stand in each place, and these."""
         while True:
-            rows: Sequence[int] = range(len(self.positions))
-            call = _arguments(method, args, kwargs) if self.refused else None
-            if call is not None and self._has_seeds(obs := call.arguments["obs"]):
-                sound = [k for k in rows if self.positions[k] not in self.refused]
-                rows = [k if k in sound else sound[0] for k in rows] if sound else rows
-                call.arguments["obs"], center = obs[list(rows)], call.arguments.get("center")
-                if center is not None and center.shape[:-1] == obs.shape[:-1]:
-                    call.arguments["center"] = center[list(rows)]
+            rows = self._rows(obs)
             try:
-                return (method(*args, **kwargs) if call is None else method(*call.args, **call.kwargs)), rows
+                return call(rows), rows
             except ConstraintError as error:
-                self._refuse(error, _arguments(method, args, kwargs).arguments["obs"], rows)
+                self._refuse(error, obs, rows)
 
-    def _refuse(self, error: ConstraintError, obs: Tensor, rows: Sequence[int]) -> None:
+    def _rows(self, obs: Tensor) -> Rows:
+        """The row of `obs` that stands in the place of each: itself, or a sound one where the seed is refused."""
+        if not self.refused or not self._has_seeds(obs):
+            return None
+        sound = [k for k, position in enumerate(self.positions) if position not in self.refused]
+        return [k if k in sound else sound[0] for k in range(len(self.positions))] if sound else None
+
+    def _refuse(self, error: ConstraintError, obs: Tensor, rows: Rows) -> None:
         """Note the seed that `error` is about, if the observations of `rows` have stood in the place of `obs`.
 
         Raises the error where it names no seed, and where no seed is left.
@@ -113,8 +107,8 @@ class Guard:
             raise error
         # The batch may have more leading dimensions than the observations, which repeat along those.
         first, *others = error.sample[len(error.sample) - len(lead) :]
-        index = (rows[first], *others)
-        self.refused[self.positions[rows[first]]] = refusal(error, obs[index])
+        row = first if rows is None else rows[first]
+        self.refused[self.positions[row]] = refusal(error, obs[(row, *others)])
         if all(position in self.refused for position in self.positions):
             raise error
 
@@ -122,9 +116,23 @@ class Guard:
         return obs.dim() > 1 and obs.shape[0] == len(self.positions)
 
 
-def _arguments(method: Callable, args: tuple, kwargs: dict[str, Any]) -> inspect.BoundArguments:
-    """The arguments of a call by their names."""
-    return inspect.signature(method).bind(*args, **kwargs)
+def replace_methods(constraint: Constraint, wrap: Callable[[str, Callable], Callable]) -> Constraint:
+    """A copy of `constraint` with `wrap(name, method)` for each public method that takes observations."""
+    changed = copy.copy(constraint)
+    for name, function in inspect.getmembers(type(constraint), inspect.isfunction):
+        if not name.startswith("_") and "obs" in inspect.signature(function).parameters:
+            setattr(changed, name, wrap(name, getattr(constraint, name)))
+    return changed
+
+
+def _call_with(rows: Sequence[int], method: Callable, args: tuple, kwargs: dict[str, Any]) -> Any:
+    """The result of `method` for these rows of its observations and centres."""
+    call = inspect.signature(method).bind(*args, **kwargs)
+    obs, center = call.arguments["obs"], call.arguments.get("center")
+    call.arguments["obs"] = obs[list(rows)]
+    if center is not None and center.shape[:-1] == obs.shape[:-1]:
+        call.arguments["center"] = center[list(rows)]
+    return method(*call.args, **call.kwargs)
 
 
 def step_apart(step_together: StepTogether) -> StepTogether:

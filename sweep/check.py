@@ -5,12 +5,10 @@ What does not work is thus found in the first second, and not after the warm-up 
 
 from __future__ import annotations
 
-import copy
-import inspect
 import io
 from collections.abc import Callable
 from dataclasses import replace
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 import torch
@@ -22,6 +20,7 @@ from constraints import Constraint
 from constraints.ray import Ray
 from core.agent import Agent
 from core.config import Config
+from core.guard import replace_methods
 from core.maps import Sample
 from core.replay import Batch
 from core.words import ConfigError
@@ -72,22 +71,16 @@ def _is_allowed(constraint: Constraint, obs: Tensor, action: Tensor) -> bool:
 
 def _named(task: str, constraint: Constraint) -> Constraint:
     """A copy of `constraint` whose methods raise ConfigErrors that name them, for errors and for impossible results."""
-    named = copy.copy(constraint)
-    for name, function in inspect.getmembers(type(constraint), inspect.isfunction):
-        if not name.startswith("_") and "obs" in inspect.signature(function).parameters:
-            setattr(named, name, _reporting(task, constraint, name))
-    return named
+    return replace_methods(constraint, partial(_reporting, task, constraint))
 
 
-def _reporting(task: str, constraint: Constraint, name: str) -> Callable:
-    method = getattr(constraint, name)
-
+def _reporting(task: str, constraint: Constraint, name: str, method: Callable) -> Callable:
     def refuse(obs: Tensor, said: str) -> ConfigError:
         return ConfigError(f"the constraint of {task} does not work: {name} at observations {_shape(obs)}: {said}")
 
     @wraps(method)
     def reporting(*args: Any, **kwargs: Any) -> Any:
-        obs: Any = inspect.signature(method).bind(*args, **kwargs).arguments["obs"]
+        obs: Any = kwargs["obs"] if "obs" in kwargs else args[0]
         try:
             result = method(*args, **kwargs)
             if isinstance(result, Ray):

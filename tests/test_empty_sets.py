@@ -10,6 +10,7 @@ from helpers import Breaks, assert_identical, outcome, run_command, train, train
 import envs
 from algos import ALGORITHMS
 from constraints import ConstraintError, LinearConstraint
+from constraints.general import linear
 from core.guard import Guard
 from core.random import stream_seed
 from envs import TASKS, Task
@@ -141,22 +142,21 @@ def test_all_seeds_may_meet_an_empty_set(tmp_path, gaps):
     assert all(failure["step"] == 0 and "result" not in failure for failure in failures(tmp_path).values())
 
 
-def test_an_error_of_no_single_seed_ends_the_run_and_says_where(tmp_path, gaps, capsys):
+def test_an_error_of_no_single_seed_ends_the_run_and_says_where(tmp_path, gaps, capsys, monkeypatch):
     words = f"algo=DRad {WORDS} checkpoint_every=10"
-    calls = []
+    calls, scaled = [], linear.unit_rows
 
-    def breaks(obs):
-        calls.append(obs)
-        if obs.dim() == 3 and obs.shape[1] == 24 and len(calls) > 150:
-            raise ZeroDivisionError("in the user's code")
-        return torch.zeros(obs.shape[:-1], dtype=torch.bool)
+    def breaks(rows, bounds):
+        calls.append(bounds.shape[:-1] == (3, 24))  # those of a batch
+        if calls[-1] and sum(calls) == 5:
+            raise ZeroDivisionError("of no single seed")
+        return scaled(rows, bounds)
 
-    gaps.is_gap = breaks
+    monkeypatch.setattr(linear, "unit_rows", breaks)
     with pytest.raises(ZeroDivisionError):
         train(tmp_path / "broken", words)
     said = capsys.readouterr().err
     assert "DRad on R+Gap, seeds 3, 5, 8, step " in said and "resumes from step 30" in said
-    gaps.is_gap = lambda obs: torch.zeros(obs.shape[:-1], dtype=torch.bool)
     train(tmp_path / "broken", words)
     train(tmp_path / "sound", words)
     assert_identical(outcome(tmp_path / "broken"), outcome(tmp_path / "sound"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -19,6 +19,7 @@ from core.trainer import Trainer
 from core.words import ConfigError, known_name, parse_words
 from envs import TASKS
 from store.checkpoint import Checkpoint, CheckpointFolder, FormatError, group_checkpoints
+from store.definition import Description
 from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
 from store.interrupt import Interrupted
 from store.lock import run_lock
@@ -49,17 +50,19 @@ def train_words(words: str) -> bool:
 
 def train_cells(cells: Sequence[Cell], stop_if_asked: Callable[[], None] = lambda: None) -> Exit:
     """Train `cells` one after the other. `stop_if_asked` raises Interrupted to end the training with a checkpoint."""
-    done = [train(cell, stop_if_asked) for cell in cells]
+    # All of them before the first training, which may change the objects that they describe.
+    definitions = [define(cell.config.env, cell.config.algo) for cell in cells]
+    done = [train(*each, stop_if_asked) for each in zip(cells, definitions, strict=True)]
     return Exit.DONE if all(done) else Exit.DIVERGED
 
 
-def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
+def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Callable[[], None] = lambda: None) -> bool:
     """Train the seeds of one cell that have not ended, from their checkpoints where there are any.
 
+    `definition` is what `sweep.definition.define` says of the cell's task and algorithm.
     Prints each result and its folder. Returns whether every seed has a result.
     """
     config, folders = on_this_machine(cell.config), dict(zip(cell.seeds, cell.folders, strict=True))
-    definition = define(config.env, config.algo)  # before its objects are used, which may change them
     torch.set_num_threads(int(config.threads))
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
@@ -209,7 +212,7 @@ def _resume(
     group: dict[int, Checkpoint],
     ended: set[int],
     info: dict[str, Any],
-    definition: dict[str, Any],
+    definition: Mapping[str, Description],
     stop_if_asked: Callable[[], None],
 ) -> None:
     """Resume the training from the checkpoints of `group`, which were written together."""

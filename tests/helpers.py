@@ -13,6 +13,7 @@ from core.words import parse_words
 from store.folder import RunWriter, find_runs, read_run, run_folder, variant_name
 from store.interrupt import Interrupted
 from sweep.cells import make_cells
+from sweep.definition import define
 from sweep.train import train as train_cell
 
 run_command = run.main
@@ -53,7 +54,7 @@ def config_of(words):
 def train(root, words, stop_if_asked=lambda: None):
     """Train the cell of `words` below `root`; whether every seed has a result."""
     (cell,) = cells_of(f"{words} results={root}")
-    return train_cell(cell, stop_if_asked)
+    return train_cell(cell, define(cell.config.env, cell.config.algo), stop_if_asked)
 
 
 def train_through(root, words, check):

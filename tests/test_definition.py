@@ -271,6 +271,23 @@ def test_a_finished_run_of_another_definition_is_not_taken_for_this_one(tmp_path
         assert "the robot: Reacher then, Slow now" in capsys.readouterr().err
 
 
+class Counts:
+    """The weights of a set; it counts its calls."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, obs):
+        self.calls += 1
+        return obs[..., 6:9:2]
+
+
+def test_a_definition_does_not_depend_on_the_cells_trained_before(tmp_path, define_task):
+    for words in (WORDS.replace("algo=DPre", "algo=DPre,DPro"), WORDS.replace("algo=DPre", "algo=DPro")):
+        define_task(l1(Counts()))
+        assert run_command(command(tmp_path, words=words)) == 0
+
+
 def test_a_run_does_not_resume_under_another_definition(tmp_path, capsys, define_task):
     define_task(Ball(0.05, 2))
     with pytest.raises(ZeroDivisionError):

@@ -20,6 +20,7 @@ from core.cuda_graph import EAGER_STEPS, GradientSteps
 from core.replay import Batch, Replay
 from store.folder import read_run
 from store.interrupt import Interrupted
+from sweep.definition import define
 from sweep.train import train as train_cell
 
 SEEDS = [3, 8]
@@ -194,7 +195,7 @@ def test_a_run_on_a_gpu_is_interrupted_and_resumed_with_the_same_bits(name, tmp_
 
     def train(folder, check=lambda: None):
         (cell,) = cells_of([*words.split(), f"results={folder}"])
-        return train_cell(cell, check)
+        return train_cell(cell, define(cell.config.env, cell.config.algo), check)
 
     calls = []
 

@@ -99,7 +99,8 @@ def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.nda
 
 
 def _all_well_formed(envs: Sequence[ActionConstrainedEnv], actions: Any) -> bool:
-    """Whether each action is well-formed and each environment ready, asked of all at once. It may say no wrongly."""
+    """Whether each action is well-formed and each environment ready, in one check of all. False may also mean that the
+    check cannot tell."""
     if not envs or not isinstance(actions, np.ndarray) or actions.shape != (len(envs), envs[0].constraint.dim):
         return False
     return all(env._obs is not None for env in envs) and bool(np.isfinite(actions).all())

@@ -51,7 +51,7 @@ def describe(parts: Mapping[str, Any]) -> Description:
 
 
 def is_own(description: Mapping[str, str]) -> bool:
-    """Whether nothing described is the user's code."""
+    """Whether the description has no code of the user."""
     return _USER not in description
 
 

@@ -169,7 +169,7 @@ def make_env(task: str, simulator: str | None) -> envs.ActionConstrainedEnv:
 def check_robot(task: str) -> None:
     """Raise ConfigError if the robot of `task` does not keep the protocol of `envs.Robot` in a few steps.
 
-    So it does if no algorithm has hyperparameters for the group that the robot names.
+    Also raised where no algorithm has hyperparameters for the group that the robot names.
     """
     robot = envs.TASKS[task].robot
     groups = {group: None for algorithm in ALGORITHMS.values() for group in algorithm.agent.paper}
@@ -241,7 +241,7 @@ def _resume(
 def _check_settings(folder: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
     """Raise ConfigError if a setting that decides what is learned differs from the one that the run started with.
 
-    So does the simulator, because the state of one does not fit another.
+    The simulator counts too, because the state of one does not fit another.
     """
     for key in now.keys() - (set(RUN_KEYS) - {"simulator"}):
         if before.get(key) != now[key]:

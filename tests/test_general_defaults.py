@@ -6,7 +6,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from constraints import Constraint, DiagonalEllipse, Intersection, LinearConstraint, QuadraticConstraint, WeightedL1
+from constraints import (
+    Constraint,
+    DiagonalEllipse,
+    Intersection,
+    InUnits,
+    LinearConstraint,
+    QuadraticConstraint,
+    WeightedL1,
+)
 
 
 def rows(obs: Tensor) -> Tensor:
@@ -31,6 +39,7 @@ def build() -> dict[str, Constraint]:
         "closed forms": Intersection(
             WeightedL1(lambda obs: obs[..., :3], 1.0, 3), DiagonalEllipse(lambda obs: obs[..., :3].square(), 0.3, 3)
         ),
+        "units": InUnits(Intersection(linear, DiagonalEllipse(lambda obs: obs[..., :3].square(), 0.3, 3)), -1.5, 2.0),
         "empty": LinearConstraint(3, rows, lambda obs: obs[..., :2] - 9.0, on_empty="least"),
     }
 

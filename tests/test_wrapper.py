@@ -381,6 +381,13 @@ def test_an_empty_set_is_reported_by_the_step():
         env.step(np.zeros(2))
 
 
+def test_a_number_in_units_keeps_its_double_precision():
+    bound = 0.05  # single precision makes 0.0500000007 of it
+    constraint = InUnits(Ball(bound, 2), -1.0, 1.0)
+    projected = constraint.project(torch.zeros(1), torch.tensor([1.0, 0.0], dtype=torch.float64))
+    assert projected[0].item() == pytest.approx(bound**0.5, rel=1e-14)
+
+
 @pytest.mark.parametrize("mapping", ["project", "alpha", "gauge", None])
 def test_the_least_violation_is_executed_where_the_constraint_says_so(mapping):
     def two_rows(obs):

@@ -27,7 +27,7 @@ class InUnits(GeneralConstraint):
 
     def __init__(self, constraint: Constraint, low: ArrayLike, high: ArrayLike):
         super().__init__(constraint.dim, constraint.on_empty)
-        least, most = (torch.as_tensor(bound, dtype=torch.float64).reshape(-1) for bound in (low, high))
+        least, most = (torch.as_tensor(bound, dtype=torch.float64, device="cpu").reshape(-1) for bound in (low, high))
         if any(len(bound) not in (1, self.dim) for bound in (least, most)):
             raise ValueError(
                 f"low and high must be numbers or have {self.dim} values, got {len(least)} and {len(most)}"
@@ -73,5 +73,6 @@ class InUnits(GeneralConstraint):
 
 
 def _constant_ellipse(dim: int, ellipse: Ellipse) -> QuadraticConstraint:
-    bound = torch.as_tensor(ellipse.bound)
-    return QuadraticConstraint(dim, lambda _: ellipse.matrix, lambda _: bound, lambda _: ellipse.center)
+    bound = ellipse.bound
+    of_obs = (lambda _: bound) if isinstance(bound, Tensor) else bound
+    return QuadraticConstraint(dim, lambda _: ellipse.matrix, of_obs, lambda _: ellipse.center)

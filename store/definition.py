@@ -109,7 +109,7 @@ class _Describer:
         elif isinstance(value, Mapping):
             self.found[path] = type(value).__name__
             for key, item in value.items():
-                self.add(f"{path}[{_plain(key) if isinstance(key, _PLAIN) else type(key).__name__}]", item)
+                self.add(f"{path}[{_plain(key)}]", item)
         elif isinstance(value, (set, frozenset)):
             self.found[path] = f"{type(value).__name__} {sorted(map(_plain, value))}"
         elif isinstance(value, (list, tuple)) and all(isinstance(item, _PLAIN) for item in value):
@@ -133,6 +133,8 @@ class _Describer:
         if isinstance(value, type):
             self.found[path] = value.__qualname__
             self._class(value)
+        elif isinstance(value, np.ufunc):
+            self.found[path] = value.__name__
         elif isinstance(value, functools.partial):
             self.found[path] = "partial"
             self.add(f"{path}.func", value.func)
@@ -226,6 +228,9 @@ class _Describer:
 
 
 def _plain(value: Any) -> str:
+    """The text of a plain value or a tuple of such; of any other one, the name of its type."""
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_plain, value))})"
     if isinstance(value, Enum):
         return str(value)
     if isinstance(value, PurePath):
@@ -278,9 +283,12 @@ def _internals(kind: type) -> set[str]:
 
 
 def _library_state(value: Any) -> dict[str, Any]:
-    """The parameters of a network; of another library's object the public numbers and texts, as the rest may change."""
+    """The modules and parameters of a network; of other objects of libraries the public numbers and texts.
+
+    The rest of those may change.
+    """
     if hasattr(value, "state_dict"):
-        return dict(value.state_dict())
+        return {"modules": str(value), **value.state_dict()}
     repr(value)  # some objects keep their text from then on, as Gymnasium's boxes do
     return {
         name: item

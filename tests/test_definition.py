@@ -82,6 +82,10 @@ def network(weight):
     return layer
 
 
+def activated(activation):
+    return torch.nn.Sequential(network(1.0), activation)
+
+
 def l1(weight):
     return WeightedL1(weight, 0.3, 2)
 
@@ -126,6 +130,10 @@ def other_project():
         (Project(), other_project(), "the value: Project then, other_project.<locals>.Project2 now"),
         (network(1.0), network(2.0), "the value's weight: [[1.0, 1.0]] then, [[2.0, 2.0]] now"),
         ({"a": 1, "b": (2, 3)}, {"a": 1, "b": (2, 4)}, "the value[b]: 2, 3 then, 2, 4 now"),
+        ({(0, 1): 1, (2, 3): 2}, {(0, 1): 5, (2, 3): 2}, "the value[(0, 1)]: 1 then, 5 now"),
+        ({(0, 1)}, {(0, 2)}, "the value: set ['(0, 1)'] then, set ['(0, 2)'] now"),
+        (np.sin, np.cos, "the value: sin then, cos now"),
+        (activated(torch.nn.ReLU()), activated(torch.nn.Tanh()), "(1): ReLU() then, (1): Tanh() now"),
     ],
 )
 def test_what_differs_is_said(before, now, said):

@@ -49,14 +49,24 @@ def check_definition(folder: Path, now: Mapping[str, Description]) -> None:
 
     Runs of the project's own tasks and algorithms may be older than definitions.
     """
-    before = read_definition(folder)
     way_out = "overwrite=true starts it again and keeps the old one"
-    if before is None:
+    if read_definition(folder) is None:
         if not all(map(is_own, now.values())):
             raise ConfigError(
                 f"{folder} does not tell on which definition of its task and algorithm it was trained; {way_out}"
             )
         return
+    if changed := what_changed(folder, now):
+        raise ConfigError(f"{folder} {changed}; {way_out}")
+
+
+def what_changed(folder: Path, now: Mapping[str, Description]) -> str:
+    """What differs between `now` and the definition that the run in `folder` was trained on.
+
+    Empty if nothing does, and for a run that is older than definitions.
+    """
+    before = read_definition(folder)
     for part, description in now.items():
-        if changed := differences(before[part], description):
-            raise ConfigError(f"{folder} was trained on another definition of its {part}: {changed}; {way_out}")
+        if before and (changed := differences(before[part], description)):
+            return f"was trained on another definition of its {part}: {changed}"
+    return ""

@@ -296,6 +296,17 @@ def test_a_definition_does_not_depend_on_the_cells_trained_before(tmp_path, defi
         assert run_command(command(tmp_path, words=words)) == 0
 
 
+def test_play_says_that_the_task_has_changed(tmp_path, capsys, define_task):
+    define_task(Ball(0.05, 2))
+    assert run_command(command(tmp_path)) == 0
+    (folder,) = tmp_path.glob("R+X/*/seed=3")
+    assert run_command(["play", str(folder), "episodes=1"]) == 0 and "note" not in capsys.readouterr().err
+    define_task(Ball(0.9, 2))
+    assert run_command(["play", str(folder), "episodes=1"]) == 0
+    said = "was trained on another definition of its task: the constraint's bound: 0.05 then, 0.9 now"
+    assert f"note: {folder} {said}" in capsys.readouterr().err
+
+
 def test_a_run_does_not_resume_under_another_definition(tmp_path, capsys, define_task):
     define_task(Ball(0.05, 2))
     with pytest.raises(ZeroDivisionError):

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from core.words import ConfigError
+from store.loggers import CSV, LOGGERS
 
 THREADS = min(torch.get_num_threads(), 4)
 """The threads of a cell that is alone on the machine: all physical cores (or OMP_NUM_THREADS), but no more than 4, as
@@ -109,6 +110,14 @@ class Config:
     )
     threads: int = setting(THREADS, "CPU threads (default: a cell alone up to 4, in a sweep 1)", AT_LEAST_ONE)
     checkpoint_every: int = setting(10_000, "environment steps of a seed between checkpoints", AT_LEAST_ONE)
+    log: str = setting(
+        CSV,
+        "where numbers go: csv (the run's files, always), tensorboard, wandb, or several, as tensorboard,wandb",
+        Rule(
+            lambda value: set(value.split(",")) <= {CSV, *LOGGERS},
+            f"must list some of {', '.join((CSV, *LOGGERS))}, with commas between them",
+        ),
+    )
 
 
 @dataclass
@@ -118,7 +127,7 @@ class PenaltyConfig(Config):
     penalty: float = setting(1.0, "names with +: weight of the penalty", NOT_NEGATIVE)
 
 
-RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "simulator", "device", "threads", "checkpoint_every")
+RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "simulator", "device", "threads", "checkpoint_every", "log")
 """Settings that do not make a run another experiment: they never show in a run's name."""
 
 

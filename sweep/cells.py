@@ -113,7 +113,7 @@ class Cell(CellFolders):
         words |= parse_variant(self.variant)[1]
         words |= {"results": str(self.root.absolute()), "overwrite": json.dumps(config.overwrite)}
         words |= {"device": config.device, "threads": str(config.threads)}
-        words["checkpoint_every"] = str(config.checkpoint_every)
+        words |= {"checkpoint_every": str(config.checkpoint_every), "log": config.log}
         if config.simulator is not None:
             words["simulator"] = config.simulator
         return [f"{key}={value}" for key, value in words.items()]

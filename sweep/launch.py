@@ -15,7 +15,7 @@ from sweep.plan import describe_plan, make_plan, memory_warning
 from sweep.settings import Sweep
 from sweep.slurm import check_gpus, submit
 from sweep.states import job_states
-from sweep.train import check_device, make_env
+from sweep.train import check_device, check_log, make_env
 
 
 def launch(sweep: Sweep, cells: Sequence[Cell], threads_given: bool, stop_if_asked: Callable[[], None]) -> Exit:
@@ -31,6 +31,7 @@ def launch(sweep: Sweep, cells: Sequence[Cell], threads_given: bool, stop_if_ask
         cells = [Cell.of(replace(cell.config, threads=threads)) for cell in cells]
     settings = cells[0].config  # one command has one device, and overwrites all cells or none
     if not on_slurm:
+        check_log(settings.log)
         check_device(settings.device)
         for task, simulator in {(cell.task, cell.config.simulator) for cell in cells if cell.config.simulator}:
             make_env(task, simulator).close()  # where it is not installed, no cell should start

@@ -155,6 +155,28 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(sorted(seeds))
 
 
+def split_values(schema: type, key: str, text: str) -> list[str]:
+    """The values of one key of the dataclass `schema` in a comma list: `1e-3,3e-4`, or `[64,64],[128,128]` of lists.
+
+    A list without brackets is one value, and so is any value of `RUN_KEYS`. Raises ConfigError for an empty value, and
+    for brackets that do not hold all of the values.
+    """
+    kind = typing.get_type_hints(schema)[keys_of(schema)[key].name]
+    if key in RUN_KEYS:
+        return [text]
+    if typing.get_origin(kind) is not list:
+        values = text.split(",")
+    elif "[" not in text and "]" not in text:
+        return [text]
+    elif re.fullmatch(r"\[[^][]*\](,\[[^][]*\])*", text):
+        values = re.findall(r"\[[^][]*\]", text)
+    else:
+        raise ConfigError(f"bad value {text!r} for {key}: expected one list, as 64,64, or several, as [64,64],[128]")
+    if not all(values):
+        raise ConfigError(f"bad value {text!r} for {key}: a value between commas is empty")
+    return list(dict.fromkeys(values))
+
+
 def override(config: DictConfig, schema: type, key: str, text: str, prefix: str = "") -> None:
     """Set one key of a structured config, the dataclass `schema`; ConfigError where `text` is not of its type.
 

@@ -22,6 +22,7 @@ options: env=W+M,R+L2 and algo=DPre+,SRad   only these, of a folder of results (
          paper=beside                       the paper's columns beside ours in tables/rewards
          out=DIR                            write below DIR (default: the folder of results, or results)
          format=md,csv,tex,png,pdf          only these (default all)
+         plugin=my.py                       your own files that register tasks and algorithms
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import tables
-from core.words import ConfigError, known_name, parse_words, split_names
+from core.words import ConfigError, closest, known_name, parse_words, split_names
 from plots import style
 from plots.aggregates import aggregate, draw_aggregates, improvement_table, mean_table
 from plots.conflicts import keep_apart
@@ -42,6 +43,8 @@ from plots.others import Source, cells_in, parse_sources, read_source
 from plots.paper import COLORS, order_algos, order_tasks
 from plots.rewards import comparison_table, reward_table
 from plots.style import own_algos
+from store.output import forgiving_output
+from sweep.plugins import load_plugins
 
 RESULTS = "results"
 RUNTIME = "bench/results/runtime.csv"
@@ -88,7 +91,8 @@ def _read(sources: Sequence[Source], options: dict[str, str]) -> Groups:
     found: list[tuple[str, str]] = []
     for root in (source.path for source in sources):
         if not root.is_dir() and root.suffix != ".csv":
-            raise ConfigError(f"{root} is not a folder")
+            close = closest(str(root), COMMANDS)
+            raise ConfigError(f"{root} is not a folder" + (f"; did you mean {close}?" if close else ""))
         found += cells_in(root)
     places = " ".join(str(source.path) for source in sources)
     tasks_there, algos_there = ({names[i] for names in found} for i in range(2))
@@ -190,7 +194,7 @@ COMMANDS = {"tables": plot_tables, "maps": plot_maps, "actions": plot_actions, "
 
 def run(arguments: Sequence[str]) -> list[Path]:
     """Carry out the command line. Returns the files written."""
-    words, options = parse_arguments(arguments)
+    words, options = parse_arguments(load_plugins(arguments))
     if not words or words[0] not in COMMANDS:
         return plot_results(words, options)
     for key in ("env", "algo", "paper"):
@@ -205,6 +209,11 @@ NAMED = 4
 
 def main(arguments: Sequence[str]) -> int:
     """Exit code: 0 done, 2 bad input."""
+    with forgiving_output():
+        return _carry_out(arguments)
+
+
+def _carry_out(arguments: Sequence[str]) -> int:
     if not arguments or "--help" in arguments or "-h" in arguments:
         print(__doc__.strip())
         return 0

@@ -9,10 +9,12 @@ from functools import partial
 
 from algos import ALGORITHMS, setting_keys
 from envs import TASKS
+from store.output import forgiving_output
 from sweep.cells import make_cells
 from sweep.exit import Exit, exit_code, stoppable
 from sweep.launch import launch
 from sweep.play import play
+from sweep.plugins import HELP, KEY, load_plugins
 from sweep.settings import SLURM_PREFIX, SlurmSettings, SweepSettings, parse_sweep
 from sweep.status import describe_status
 from sweep.train import train_cells
@@ -38,7 +40,7 @@ def usage() -> str:
         "keys (defaults depend on algorithm and task: the paper's hyperparameter table):",
     ]
     lines += [f"  {key:18s} {f.metadata['help']}" for key, f in setting_keys().items() if key not in ("algo", "env")]
-    lines += ["", "keys of a sweep (not part of any run's name):"]
+    lines += ["", "keys of a sweep (not part of any run's name):", f"  {KEY:18s} {HELP}"]
     for schema, prefix in ((SweepSettings, ""), (SlurmSettings, SLURM_PREFIX)):
         lines += [f"  {prefix + f.name:18s} {f.metadata['help']}" for f in fields(schema)]
     lines.append("  slurm.NAME         any other parameter of sbatch, as slurm.account=mine slurm.exclusive=true")
@@ -47,23 +49,24 @@ def usage() -> str:
 
 def carry_out(arguments: Sequence[str], stop_if_asked: Callable[[], None]) -> Exit:
     """Train what the arguments ask for. `stop_if_asked` raises Interrupted once a signal has asked for the end."""
-    sweep, settings = parse_sweep(arguments)
+    sweep, settings = parse_sweep(load_plugins(arguments))
     cells = make_cells(settings)
     if sweep.wanted:
-        return launch(sweep, cells, "threads" in settings, stop_if_asked)
+        return launch(sweep, cells, stop_if_asked)
     return train_cells(cells, stop_if_asked)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Exit code: 0 done, 2 bad input, 3 a seed diverged, 4 a cell of a sweep failed, 128 + n ended by signal n."""
-    if not arguments or {"-h", "--help", "help"} & set(arguments):
-        print(usage())
-        return Exit.DONE
-    if arguments[0] == "status":
-        return exit_code(lambda: print(describe_status(arguments[1:])) or Exit.DONE)
-    if arguments[0] == "play":
-        return exit_code(lambda: stoppable(partial(play, arguments[1:])))
-    return exit_code(lambda: stoppable(partial(carry_out, arguments)))
+    with forgiving_output():
+        if not arguments or {"-h", "--help", "help"} & set(arguments):
+            print(usage())
+            return Exit.DONE
+        if arguments[0] == "status":
+            return exit_code(lambda: print(describe_status(load_plugins(arguments[1:]))) or Exit.DONE)
+        if arguments[0] == "play":
+            return exit_code(lambda: stoppable(partial(play, load_plugins(arguments[1:]))))
+        return exit_code(lambda: stoppable(partial(carry_out, arguments)))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from constraints import Constraint
 from core.agent import Agent
 from core.config import Config, PenaltyConfig, keys_of, restore_settings
 from core.maps import Alpha, Gauge, Map, Placement, Project, Radial
-from core.words import known_name
+from core.words import NameTable, known_name
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,8 @@ class Algorithm:
         return self.agent(config, constraint, obs_dim, seeds, map=self.map, placement=self.placement)
 
 
-ALGORITHMS: dict[str, Algorithm] = {
+ALGORITHMS = NameTable[Algorithm]("algorithm")
+ALGORITHMS |= {
     "DPro": Algorithm(TD3, Project(), "rollout"),
     "DPro+": Algorithm(TD3, Project(), "rollout", penalty=True),
     "DPre": Algorithm(TD3, Project(), "environment"),

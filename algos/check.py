@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -61,7 +62,7 @@ def check(name: str, algorithm: Any) -> None:
 
 
 def check_parameters(name: str, alone: Agent, among: Agent) -> None:
-    """Raise ContractError if the agents, one of a single seed and one with others after it, share parameters."""
+    """Raise ContractError if the agents, one of a single seed and one with others before it, share parameters."""
     one, several = ({key: tuple(p.shape) for key, p in _parameters(agent).items()} for agent in (alone, among))
     if one.keys() != several.keys():
         raise ContractError(f"{name}: parameters have other names with other numbers of seeds: {one} and {several}")
@@ -73,7 +74,7 @@ def check_parameters(name: str, alone: Agent, among: Agent) -> None:
                 " your own) one generator of `init` for each row"
             )
     for key, values in alone.state(0).items():
-        if not torch.equal(values, among.state(0)[key]):
+        if not torch.equal(values, among.state(len(among.seeds) - 1)[key]):
             raise ContractError(
                 f"{name}: the initial values of {key} are not the same for a seed alone and among others; row i must be"
                 " drawn from the generator init[i]"
@@ -86,7 +87,7 @@ class _Check:
 
     def run(self) -> None:
         with self._own_randomness("while it is built"):
-            alone, among = self._build(SEEDS[:1]), self._build(SEEDS)
+            alone, among = self._build(SEEDS[-1:]), self._build(SEEDS)
             check_parameters(self.name, alone, among)
         self._check_registered(among)
         self._check_acting(self._build(SEEDS))
@@ -335,6 +336,7 @@ class _Drift(gymnasium.Env):
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBS,), np.float64)
     largest_violation, executed_actions = -np.inf, 0
+    robot = SimpleNamespace(max_episode_steps=9)  # of which a progress bar asks this
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)

@@ -26,7 +26,7 @@ def machine_name(device: torch.device) -> str:
 
 
 def make_config(algo: str, **settings: object) -> Config:
-    """The paper's configuration of `algo` on the task, with other `settings`."""
+    """The paper's configuration of `algo` on the task, or on another one (`env`), with other `settings`."""
     words = {key: str(value) for key, value in settings.items()}
     (cell,) = make_cells({"algo": algo, "env": TASK} | words)
     return cell.config
@@ -34,9 +34,13 @@ def make_config(algo: str, **settings: object) -> Config:
 
 def make_agent(name: str, batch: int, seeds: Sequence[int], device: torch.device | str = "cpu") -> Agent:
     """A new agent with the paper's settings for the task and another batch size."""
-    config = make_config(name, batch_size=batch, device=device)
-    obs_dim = envs.make(TASK).observation_space.shape[0]
-    return ALGORITHMS[name].build(config, envs.constraint(TASK), obs_dim, seeds)
+    return agent_of(make_config(name, batch_size=batch, device=device), seeds)
+
+
+def agent_of(config: Config, seeds: Sequence[int]) -> Agent:
+    """A new agent with these settings."""
+    obs_dim = envs.TASKS[config.env].robot.obs_dim
+    return ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, seeds)
 
 
 def fill_replay(agent: Agent, transitions: int) -> Replay:
@@ -44,7 +48,7 @@ def fill_replay(agent: Agent, transitions: int) -> Replay:
     seeds = agent.seeds
     everyone = range(len(seeds))
     replay = Replay(seeds, transitions, agent.obs_dim, agent.action_dim, agent.stores_centers, agent.device)
-    robots = [envs.make(TASK) for _ in seeds]
+    robots = [envs.make(agent.config.env) for _ in seeds]
     obs = stack([env.reset(seed=stream_seed(seed, "environment"))[0] for env, seed in zip(robots, seeds, strict=True)])
     for _ in range(transitions):
         action = agent.act(obs, agent.centers(obs), everyone, [])

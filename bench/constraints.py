@@ -1,6 +1,6 @@
 """Speed of the constraints package beside general solvers, on one thread.
 
-    python bench/constraints.py                                          # all tasks, batches and installed solvers
+    python bench/constraints.py                                          # all sets, batches and installed solvers
     python bench/constraints.py task=W+M,HC+O batch=1,100 baselines=osqp,linprog out=results/bench
     python bench/constraints.py baselines=none                           # this package alone
 
@@ -9,12 +9,14 @@ constraints.csv.
 
 Times are CPU time, the least of several repeats. `project + gradient` is forward and backward. Velocities and angles
 are drawn so that the constraint holds the action back for a fair share, which the table gives: every entry of an
-observation is normal with standard deviation 1 on Reacher and 8 elsewhere, actions are uniform in the box.
+observation is normal with standard deviation 1 on Reacher and 8 elsewhere, actions are uniform in the box. `task` takes
+the paper's tasks and the sets of `bench/own_sets.py`, such as 2x6 for two rows in six dimensions.
 
 The baselines take the same numbers: `osqp` (a loop; projection on linear sets; tolerance 1e-6), `gurobi` (a loop;
-projection), `cvxpylayers` (projection and its gradient, in each set's most compact form), `qpth` (batched; the same on
-linear sets), `linprog` (SciPy's HiGHS, a loop; centre and oracle of linear sets). Those not installed are left out:
-`pip install .[bench]` for cvxpylayers, `pip install --no-deps qpth` (it asks for numpy 1), `pip install gurobipy`.
+projection), `cvxpylayers` (projection and its gradient on the paper's sets, in their most compact forms), `qpth`
+(batched; the same on linear sets), `linprog` (SciPy's HiGHS, a loop; centre and oracle of linear sets). Those not
+installed are left out: `pip install .[bench]` for cvxpylayers, `pip install --no-deps qpth` (it asks for numpy 1),
+`pip install gurobipy`.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ from scipy.optimize import linprog
 from torch import Tensor
 from tqdm import tqdm
 
+from bench.own_sets import own_sets
 from constraints import (
     Ball,
     Constraint,
@@ -47,6 +50,7 @@ from constraints import (
     WeightedL1AndEllipse,
     WeightedPositivePart,
 )
+from constraints.general.base import GeneralConstraint
 from core.words import ConfigError, parse_words, split_names, whole_numbers
 from envs import TASKS
 from envs.reacher import Reacher
@@ -55,6 +59,7 @@ from store.provenance import processor
 Operation = Callable[[Tensor, Tensor], Tensor]
 """(obs (batch, n), action (batch, d)) -> the operation's result (batch, d)."""
 
+SETS = {name: task.constraint for name, task in TASKS.items()} | own_sets()
 OURS = "this package"
 BASELINES = {"osqp": 64, "gurobi": 16, "cvxpylayers": 16, "qpth": 256, "linprog": 16}
 """The largest batch that each is measured on. Longer ones are taken to cost in proportion."""
@@ -84,7 +89,7 @@ def closed_forms(constraint: Constraint) -> dict[str, Operation]:
 
 
 def is_linear(constraint: Constraint) -> bool:
-    return not isinstance(constraint, Ball | PlanarEllipse | WeightedL1AndEllipse)
+    return not constraint.explicit(torch.zeros(1, 17, dtype=torch.float64)).ellipses
 
 
 def each_row(constraint: Constraint, obs: Tensor):
@@ -148,6 +153,8 @@ def cvxpy_layer(constraint: Constraint) -> dict[str, Operation]:
     import cvxpy as cp
     from cvxpylayers.torch import CvxpyLayer
 
+    if isinstance(constraint, GeneralConstraint):
+        return {}
     action, target = cp.Variable(constraint.dim), cp.Parameter(constraint.dim)
     limits, parameters, values = [action <= 1, action >= -1], [target], []
 
@@ -250,11 +257,10 @@ MODULES = {"osqp": "osqp", "gurobi": "gurobipy", "cvxpylayers": "cvxpylayers", "
 def draw(task: str, batch: int) -> tuple[Tensor, Tensor]:
     """Observations (batch, n) and actions (batch, d)."""
     generator = torch.Generator().manual_seed(0)
-    robot, constraint = TASKS[task].robot, TASKS[task].constraint
-    spread = 1.0 if robot is Reacher else 8.0
+    spread = 1.0 if task in TASKS and TASKS[task].robot is Reacher else 8.0
     # The sets look at the first 17 entries at most.
     obs = torch.randn(batch, 17, generator=generator, dtype=torch.float64) * spread
-    return obs, 2.0 * torch.rand(batch, constraint.dim, generator=generator, dtype=torch.float64) - 1.0
+    return obs, 2.0 * torch.rand(batch, SETS[task].dim, generator=generator, dtype=torch.float64) - 1.0
 
 
 def cpu_time(call: Callable[[], Tensor], budget: float = 0.3, repeats: int = 200) -> float:
@@ -279,7 +285,7 @@ def cpu_time(call: Callable[[], Tensor], budget: float = 0.3, repeats: int = 200
 
 def measure(task: str, batches: list[int], solvers: list[str]) -> list[dict]:
     """One record for each operation, solver and batch size: CPU seconds, and from how many samples they are known."""
-    constraint = TASKS[task].constraint
+    constraint = SETS[task]
     records = []
     for solver in (OURS, *solvers):
         operations = closed_forms(constraint) if solver == OURS else SOLVERS[solver](constraint)
@@ -295,7 +301,7 @@ def measure(task: str, batches: list[int], solvers: list[str]) -> list[dict]:
 
 def active_share(task: str) -> float:
     obs, action = draw(task, 2560)
-    return (TASKS[task].constraint.violation(obs, action) > 0.0).double().mean().item()
+    return (SETS[task].violation(obs, action) > 0.0).double().mean().item()
 
 
 def machine() -> str:
@@ -311,8 +317,8 @@ def table(records: list[dict], batches: list[int]) -> str:
     lines = [" | ".join(header), " | ".join(["---"] * 4 + ["---:"] * (len(batches) + 1))]
     shares = {task: f"{active_share(task):.0%}" for task in dict.fromkeys(r["task"] for r in records)}
     rows = sorted({(r["task"], r["operation"], r["solver"]): None for r in records}, key=lambda r: (r[0], r[1]))
-    order = list(TASKS)
-    rows.sort(key=lambda r: (order.index(r[0]), list(closed_forms(TASKS[r[0]].constraint)).index(r[1])))
+    order = list(SETS)
+    rows.sort(key=lambda r: (order.index(r[0]), list(closed_forms(SETS[r[0]])).index(r[1])))
     for task, operation, solver in rows:
         cells = []
         for batch in batches:
@@ -330,7 +336,7 @@ def choices(arguments: list[str]) -> tuple[list[str], list[int], list[str], Path
     known = {"task": "all", "batch": "1,16,100,256,2560", "baselines": "all", "out": "bench/results"}
     known |= parse_words(arguments, known)
     solvers = split_names("baseline", known["baselines"], BASELINES, {"none": ()})
-    tasks, batches = split_names("task", known["task"], TASKS), whole_numbers("batch", known["batch"])
+    tasks, batches = split_names("task", known["task"], SETS), whole_numbers("batch", known["batch"])
     return tasks, batches, solvers, Path(known["out"])
 
 

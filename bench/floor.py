@@ -148,7 +148,7 @@ class Floor:
     Matrices of one name are one piece of memory, so that as much of it passes through the caches as in training.
     """
 
-    def __init__(self, update: Update):
+    def __init__(self, update: Update, device: torch.device | str = "cpu"):
         self.updates, self.delay = 0, update.delay
         shapes: dict[str, tuple[int, ...]] = {}
         for product in update.always + update.delayed:
@@ -159,6 +159,7 @@ class Floor:
         generator = torch.Generator().manual_seed(0)
         # As small as weights, so that no product overflows.
         self.memory = {name: 0.1 * torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+        self.memory = {name: matrix.to(device) for name, matrix in self.memory.items()}
         self.always = [self._views(product) for product in update.always]
         self.delayed = [self._views(product) for product in update.delayed]
 

@@ -29,7 +29,7 @@ from core.config import differences
 from core.words import ConfigError, parse_words, split_names
 from envs import TASKS
 from store.files import one_line
-from store.folder import Run, find_runs, has_ended, parse_variant, read_run, variant_name
+from store.folder import Run, find_runs, has_ended, parse_variant, read_run, variant_folder, variant_name
 from store.published import PublishedRun, read_published, write_published
 from sweep.cells import paper_config
 
@@ -101,7 +101,7 @@ def _check_settings(run: Run) -> None:
     if run.task not in TASKS or run.algo not in ALGORITHMS:
         raise RefusedError(f"{run.algo} on {run.task} is not of this project")
     config = saved_config(run.config)
-    variant = variant_name(config.algo, differences(config, paper_config(config.algo, config.env)))
+    variant = variant_folder(variant_name(config.algo, differences(config, paper_config(config.algo, config.env))))
     for says, holds in ((run.task, config.env), (run.variant, variant), ((run.seed,), config.seeds)):
         if says != holds:
             raise RefusedError(f"its folder says {says}, its config.yaml {holds}")

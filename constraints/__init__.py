@@ -3,8 +3,9 @@
 from constraints.ball import Ball
 from constraints.base import Constraint
 from constraints.box import Box
+from constraints.coefficients import check_inputs
 from constraints.ellipse import DiagonalEllipse, PlanarEllipse
-from constraints.errors import ConstraintError
+from constraints.errors import ConstraintError, EmptySetError
 from constraints.general import Intersection, InUnits, LinearConstraint, QuadraticConstraint
 from constraints.l1_and_ellipse import WeightedL1AndEllipse
 from constraints.weighted import HalfSpace, WeightedL1, WeightedPositivePart
@@ -15,6 +16,7 @@ __all__ = [
     "Constraint",
     "ConstraintError",
     "DiagonalEllipse",
+    "EmptySetError",
     "HalfSpace",
     "InUnits",
     "Intersection",
@@ -24,4 +26,5 @@ __all__ = [
     "WeightedL1",
     "WeightedL1AndEllipse",
     "WeightedPositivePart",
+    "check_inputs",
 ]

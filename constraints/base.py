@@ -12,16 +12,20 @@ parameters of learned coefficients exist as well; they take more time, and only 
 
 from __future__ import annotations
 
+import operator
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from constraints.checks import ON_BOUNDARY, check_tensor
+from constraints.coefficients import FirstCalls
+from constraints.errors import name_samples, require
 from constraints.gauge import box_gauge_gradient, largest_gauge
 from constraints.implicit import Boundary, Solver, differentiable_projection, tensors_of
 from constraints.jacobian import JacobianProduct, with_jacobian
-from constraints.numerics import is_traced, keep_nan, one_where_zero, with_gradient
+from constraints.numerics import is_traced, keep_nan, one_where_zero, refuse_transforms, with_gradient
 from constraints.ray import Ray
 from constraints.sample import hit_and_run
 
@@ -46,7 +50,7 @@ class ExplicitSet(NamedTuple):
 
 
 class Constraint(ABC):
-    """A feasible set A(obs) inside the box [-1, 1]^dim. ValueError for dim < 1.
+    """A feasible set A(obs) inside the box [-1, 1]^dim. ValueError for dim < 1, TypeError where it is not whole.
 
     A subclass implements the protected methods. They receive float64 tensors; `action` (or `direction`, `gradient`)
     has the common leading shape already. `at` is what `_at(obs)` returned: the observation, if that is not overridden.
@@ -54,13 +58,16 @@ class Constraint(ABC):
 
     origin_centered: bool = True
     """True where `center(obs)` is the origin for every obs, so that no centre needs to be stored."""
+    on_empty: str = "error"
+    """What happens where no action meets the constraint, "error" or "least"; see `GeneralConstraint`."""
     solved_on_cpu: bool = False
     """True where a solver runs on the CPU, so that a GPU has to wait. No CUDA graph can hold such a set."""
 
     def __init__(self, dim: int):
         if dim < 1:
             raise ValueError(f"dim must be at least 1, got {dim}")
-        self.dim = dim
+        self.dim = operator.index(dim)
+        self._center_calls = FirstCalls()
 
     # ---------------------------------------------------------------- what a subclass gives
 
@@ -113,9 +120,9 @@ class Constraint(ABC):
         """The paper's penalty (...), with finite gradients everywhere. A set with several rows overrides this."""
         return self._violation(at, action).clamp(min=0.0)
 
-    def _center(self, at: Any) -> Tensor | None:
-        """Interior point (..., d), or a single one (d,) for every obs; None for the origin."""
-        return None
+    def _center(self, at: Any) -> Tensor:
+        """Interior point (..., d), or a single one (d,) for every obs. A set with `origin_centered` has none."""
+        raise NotImplementedError(f"{type(self).__name__} needs _center, or origin_centered = True")
 
     def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
         """Points (..., count, d), uniform in the set. A set with a closed form overrides this."""
@@ -144,6 +151,10 @@ class Constraint(ABC):
         box = action64.abs().amax(-1) - 1.0
         return torch.maximum(box, self._violation(self._at(obs64), action64)).to(action.dtype)
 
+    def contains(self, obs: Tensor, action: Tensor, tolerance: float = 1e-6) -> Tensor:
+        """Whether (...) the action is feasible up to `tolerance`, in the units of `violation`; False for a NaN."""
+        return self.violation(obs, action) <= tolerance
+
     def penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         """Penalty (...) of the '+' algorithms on an action in the box (paper, "Algorithms").
 
@@ -158,8 +169,7 @@ class Constraint(ABC):
         obs64, action64 = self._broadcast(obs, action)
         at = self._at(obs64)
         if is_traced(*tensors_of(at)):
-            solver = Solver(self._project, self._boundaries, self._free)
-            return differentiable_projection(solver, at, action64).to(action.dtype)
+            return self._differentiable_projection(at, action64).to(action.dtype)
         projected, jacobian = self._project(at, action64.detach())
         if projected.requires_grad:
             self._boundaries(at, projected)
@@ -167,16 +177,22 @@ class Constraint(ABC):
             return with_jacobian(action.expand(action64.shape), projected, jacobian)
         return projected.to(action.dtype)
 
+    def least_violation(self, obs: Tensor) -> Tensor:
+        """The least violation (...) that an action in the box can have, at obs (..., n); 0 if the set has one."""
+        return obs.new_zeros(obs.shape[:-1])  # closed forms contain the origin
+
     def center(self, obs: Tensor) -> Tensor:
         """Interior point (..., d) of the set, in the dtype of `obs` (paper, "alpha-Projection Layer").
 
         It is the Chebyshev centre of a linear set, the ellipse's centre otherwise, the origin where both are present.
+        The classes of sets of one's own say what theirs is.
         """
+        check_tensor("obs", obs)
         if not obs.is_floating_point():
             raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
-        center = self._center(self._at(obs.double()))
-        if center is None:
+        if self.origin_centered:
             return obs.new_zeros(*obs.shape[:-1], self.dim)
+        center = self._center(self._at(obs.double()))
         return center.expand(*obs.shape[:-1], self.dim).to(obs.dtype)
 
     def gauge(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> Tensor:
@@ -185,8 +201,8 @@ class Constraint(ABC):
         `center + direction / L` is on the boundary; L is convex and positively homogeneous of degree 1.
         """
         obs64, direction64 = self._broadcast(obs, direction)
-        center64 = None if center is None else center.double()
         at = self._at(obs64)
+        center64 = None if center is None else self._given_center(at, center)
         # L is homogeneous. At length 1, the squares of even the tiniest direction stay above zero.
         size = one_where_zero(direction64.detach().abs().amax(-1))
         if is_traced(center64, *tensors_of(at)):
@@ -203,7 +219,10 @@ class Constraint(ABC):
         """
         obs64, action64 = self._broadcast(obs, action)
         at = self._at(obs64)
-        center64 = self._center(at) if center is None else center.double()
+        if center is None:
+            center64 = None if self.origin_centered else self._center(at)
+        else:
+            center64 = self._given_center(at, center)
         offset = action64 if center64 is None else action64 - center64
         traced = is_traced(center64, *tensors_of(at))
         return Ray(
@@ -246,8 +265,10 @@ class Constraint(ABC):
     def linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction).
 
-        It is a constant: no gradients pass. RuntimeError where the observation or learned coefficients ask for them.
+        It is a constant, without gradients. RuntimeError where the observation or learned coefficients ask for them.
         """
+        check_tensor("gradient", gradient)
+        refuse_transforms("linear_oracle")
         obs64, gradient64 = self._broadcast(obs, gradient.detach())
         at = self._at(obs64)
         if torch.is_grad_enabled() and any(value.requires_grad for value in tensors_of(at)):
@@ -270,6 +291,10 @@ class Constraint(ABC):
 
     # ---------------------------------------------------------------- shared pieces
 
+    def _differentiable_projection(self, at: Any, action: Tensor) -> Tensor:
+        """The projection (..., d) with gradients by the action and by the tensors of `at`."""
+        return differentiable_projection(Solver(self._project, self._boundaries, self._free), at, action)
+
     def _gauge_and_gradient(self, at: Any, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         """Gauge (...) of the whole set, box included, and its gradient (..., d), both 0 where `direction` is.
 
@@ -278,13 +303,37 @@ class Constraint(ABC):
         box = box_gauge_gradient(direction, center)
         return largest_gauge(direction, box, *self._gauge_gradients(at, direction, center))
 
+    def _given_center(self, at: Any, center: Tensor) -> Tensor:
+        """A centre (..., d) that was given, in float64. ValueError for another shape, and see `_check_center`."""
+        check_tensor("center", center)
+        if center.shape[-1:] != (self.dim,):
+            raise ValueError(f"expected {self.dim} coordinates of the center, got shape {tuple(center.shape)}")
+        center = center.double()
+        if self._center_calls.wanted():
+            self._check_center(at, center)
+        return center
+
+    @torch.no_grad()
+    def _check_center(self, at: Any, center: Tensor) -> None:
+        """Raise a ConstraintError for a centre that is not inside the set; a NaN is passed on."""
+        if self._center_calls.readable(center):
+            excess = torch.maximum(center.abs().amax(-1) - 1.0, self._violation(at, center))
+            require(~(excess >= -ON_BOUNDARY).flatten(), "the center is not inside the set", name_samples(excess.shape))
+
     def _broadcast(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Both in float64, the action with the common leading shape. ValueError or TypeError for a wrong action."""
-        if action.shape[-1] != self.dim:
-            raise ValueError(f"expected {self.dim} action coordinates, got {action.shape[-1]}")
+        check_tensor("obs", obs)
+        check_tensor("action", action)
+        if action.shape[-1:] != (self.dim,):
+            raise ValueError(f"expected {self.dim} action coordinates, got shape {tuple(action.shape)}")
         if not action.is_floating_point():
             raise TypeError(f"expected float32 or float64 actions, got {action.dtype}")
         obs, action = obs.double(), action.double()
         if obs.shape[:-1] != action.shape[:-1]:
-            action = action.expand(*torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1]), self.dim)
+            try:
+                lead = torch.broadcast_shapes(obs.shape[:-1], action.shape[:-1])
+            except RuntimeError:
+                shapes = f"{tuple(obs.shape)} and {tuple(action.shape)}"
+                raise ValueError(f"leading shapes of obs and action do not broadcast: {shapes}") from None
+            action = action.expand(*lead, self.dim)
         return obs, action

@@ -1,41 +1,124 @@
-"""The coefficients of the closed forms: functions of the observation, and bounds that may be numbers."""
+"""The coefficients of the closed forms: functions of the observation, and bounds that may be numbers.
+
+They are checked on their first observations, because a check takes as long as a closed form. `check_inputs(True)` has
+them checked always.
+"""
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
-from constraints.errors import check_bound
+from constraints.checks import check_tensor, checked
+from constraints.errors import ConstraintError, check_bound, name_samples, require
+from constraints.numerics import is_transformed
 
 Coefficients = Callable[[Tensor], Tensor]
 """Maps observations (..., n) to a constraint's state-dependent coefficients (..., d) or (..., d, d)."""
 Bound = float | Coefficients
 """A positive number, or a function from observations (..., n) to positive numbers (...)."""
 
+_FIRST = 100  # the number of calls that are checked
+_always = False
+
+
+def check_inputs(always: bool = True) -> None:
+    """Have the closed forms check coefficients and given centres in every call of this process, not just in the first.
+
+    They raise a ConstraintError for values that are NaN, infinite or of the wrong sign or shape, for a matrix that is
+    not symmetric and positive semi-definite, and for a centre that is not inside the set. General sets always do. On a
+    GPU, each check waits for the device; in a CUDA graph there can be none.
+    """
+    global _always
+    _always = always
+
+
+class FirstCalls:
+    """Tells which calls to check: those of the first that have values which Python can look at without waiting."""
+
+    def __init__(self) -> None:
+        self._left = _FIRST
+
+    def wanted(self) -> bool:
+        """Whether to check shapes in this call, and values where `readable` allows it."""
+        # torch.compile would compile anew for each number of calls.
+        return (self._left > 0 and not torch.compiler.is_compiling()) or _always
+
+    def readable(self, *values: Tensor) -> bool:
+        """Whether to check values in this call, which counts."""
+        self._left -= 1
+        return (
+            all(value.is_cpu or (_always and value.device.type != "meta") for value in values) and not is_transformed()
+        )
+
 
 class Coefficient:
-    """A function of the observation, in float64."""
+    """A function of the observation whose values have the last axes `shape`; `check` says what else they must be.
 
-    def __init__(self, function: Coefficients):
-        self._function = function
+    A ConstraintError names the coefficient by `what` and, where values are wrong, the sample. Observations that are
+    not finite give what they give: their NaN is passed on.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        function: Coefficients,
+        shape: tuple[int, ...],
+        check: Callable[[Tensor, str], object] | None = None,
+    ):
+        if not callable(function):
+            raise TypeError(f"{what} must be a function of the observation, got {type(function).__name__}")
+        self._what, self._function, self._shape, self._check = f"{what}(obs)", function, shape, check
+        self._calls = FirstCalls()
 
     def __call__(self, obs: Tensor) -> Tensor:
-        """The coefficients (..., d) or (..., d, d) at obs (..., n)."""
-        return self._function(obs).double()
+        """The values (..., *shape), float64, at obs (..., n)."""
+        values = self._function(obs)
+        if self._calls.wanted():
+            values = self._checked(values, obs)
+        return values.double()
+
+    def _checked(self, values: Tensor, obs: Tensor) -> Tensor:
+        check_tensor(self._what, values)
+        if values.is_complex():
+            raise ConstraintError(f"{self._what} is complex")
+        look = self._calls.readable(obs) and bool(obs.isfinite().all())
+        values = checked(values, self._what, self._shape, obs, finite=look)
+        if look and self._check is not None:
+            self._check(values, self._what)
+        return values
 
 
 class BoundCoefficient:
     """A bound, ready to be compared with (..., 1). ValueError for a number that is not positive and finite."""
 
-    def __init__(self, bound: Bound):
-        if not callable(bound):
+    def __init__(self, what: str, bound: Bound):
+        self._number: float | None = None
+        if callable(bound):
+            self._values = Coefficient(what, bound, (), check_positive)
+        else:
+            if not isinstance(bound, numbers.Real):
+                raise TypeError(f"{what} must be a number or a function of the observation, got {type(bound).__name__}")
             check_bound(bound)
-        self._bound = bound
+            self._number = float(bound)
 
     def __call__(self, obs: Tensor) -> Tensor | float:
         """The number, or the function's values (..., 1) at obs (..., n)."""
-        return self._bound(obs).double().unsqueeze(-1) if callable(self._bound) else self._bound
+        return self._values(obs).unsqueeze(-1) if self._number is None else self._number
+
+
+def check_positive(values: Tensor, what: str) -> None:
+    """Raise a ConstraintError for values (...) that are not positive."""
+    require((values > 0.0).flatten(), f"{what} is not positive", name_samples(tuple(values.shape)))
+
+
+def check_not_negative(values: Tensor, what: str) -> None:
+    """Raise a ConstraintError for values (..., d) that are negative."""
+    valid = (values >= 0.0).all(-1)
+    require(valid.flatten(), f"{what} is negative", name_samples(tuple(valid.shape)))
 
 
 def flat(bound: Tensor | float) -> Tensor | float:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from constraints.numerics import refuse_second_derivatives
+from constraints.numerics import refuse_second_derivatives, refuse_transforms
 
 _NODES = 28  # Gauss-Legendre nodes on the window of the ray integral
 _DROP = 25.0  # the window ends where the log of the integrand has fallen by at least this much
@@ -54,6 +54,7 @@ def radial_log_det(gauge: Tensor, dim: int) -> Tensor:
     Returns:
         (...) the log-determinant, at most 0; its gradient at L = 0 is 0.
     """
+    refuse_transforms("the density of the radial map")
     return _RadialLogDet.apply(gauge, dim)
 
 
@@ -61,7 +62,9 @@ def radial_log_det(gauge: Tensor, dim: int) -> Tensor:
 def _quadrature(device: torch.device) -> tuple[Tensor, Tensor]:
     """Gauss-Legendre nodes and weights on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    return torch.as_tensor((nodes + 1) / 2, device=device), torch.as_tensor(weights / 2, device=device)
+    # Whatever the mode of the first caller: autograd takes no tensors that were made in inference mode.
+    with torch.inference_mode(False):
+        return torch.as_tensor((nodes + 1) / 2, device=device), torch.as_tensor(weights / 2, device=device)
 
 
 def log_ray_integral(
@@ -167,4 +170,5 @@ def alpha_boundary_log_density(
     Returns:
         (...) log q(b), in the type of `boundary_offset`.
     """
+    refuse_transforms("the density of the alpha map")
     return _AlphaBoundaryLogDensity.apply(boundary_offset, gauge_gradient, center, mean, std)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from constraints.base import Constraint, Ellipse, ExplicitSet
-from constraints.coefficients import Bound, BoundCoefficient, Coefficient, Coefficients, flat
+from constraints.checks import check_semidefinite
+from constraints.coefficients import Bound, BoundCoefficient, Coefficient, Coefficients, check_not_negative, flat
 from constraints.implicit import Boundary
 from constraints.jacobian import JacobianProduct, deflated_jacobian
 from constraints.numerics import keep_nan, safe_sqrt
@@ -35,7 +36,8 @@ class DiagonalEllipse(Constraint):
     def __init__(self, scale: Coefficients, bound: Bound, dim: int):
         super().__init__(dim)
         self.scale, self.bound = scale, bound
-        self._scale_at, self._bound_at = Coefficient(scale), BoundCoefficient(bound)
+        self._scale_at = Coefficient("scale", scale, (dim,), check_not_negative)
+        self._bound_at = BoundCoefficient("bound", bound)
 
     def _at(self, obs: Tensor) -> Scales:
         return Scales(self._scale_at(obs), self._bound_at(obs))
@@ -74,7 +76,8 @@ class PlanarEllipse(Constraint):
     def __init__(self, matrix: Coefficients, bound: Bound):
         super().__init__(2)
         self.matrix, self.bound = matrix, bound
-        self._matrix_at, self._bound_at = Coefficient(matrix), BoundCoefficient(bound)
+        self._matrix_at = Coefficient("matrix", matrix, (2, 2), check_semidefinite)
+        self._bound_at = BoundCoefficient("bound", bound)
 
     def _at(self, obs: Tensor) -> _Planar:
         matrix = self._matrix_at(obs)

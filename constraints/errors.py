@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from torch import Tensor
 
 
@@ -50,7 +52,7 @@ class ConstraintError(ValueError):
 
 
 class EmptySetError(ConstraintError):
-    """No action meets the constraint of one sample."""
+    """No action meets the constraint of one sample, or none has room around it where a method needs that."""
 
 
 def name_samples(lead: tuple[int, ...]) -> SampleName:
@@ -59,9 +61,9 @@ def name_samples(lead: tuple[int, ...]) -> SampleName:
 
 
 def check_bound(bound: float) -> None:
-    """Raise a ValueError for a bound that is not positive."""
-    if bound <= 0.0:
-        raise ValueError(f"bound must be positive for the origin to be interior, got {bound}")
+    """Raise a ValueError for a bound that is not positive and finite."""
+    if not 0.0 < bound < math.inf:
+        raise ValueError(f"bound must be positive for the origin to be interior, and finite, got {bound}")
 
 
 def require(valid: Tensor, message: str, name: SampleName, error: type[ConstraintError] = ConstraintError) -> None:

@@ -32,11 +32,22 @@ def times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
+def is_transformed() -> bool:
+    """Whether a transform of torch.func is at work, so that tensors may have hidden axes."""
+    return torch._C._are_functorch_transforms_active()
+
+
+def refuse_transforms(what: str) -> None:
+    """Raise a RuntimeError where a transform of torch.func is at work."""
+    if is_transformed():
+        raise RuntimeError(f"{what} has no torch.func transforms; it takes batches of any leading shape as it is")
+
+
 def is_traced(*values: object) -> bool:
     """Whether autograd records what is done with one of the values, or a transform of torch.func is at work."""
-    if torch._C._are_functorch_transforms_active():
-        return True
-    return torch.is_grad_enabled() and any(isinstance(value, Tensor) and value.requires_grad for value in values)
+    return is_transformed() or (
+        torch.is_grad_enabled() and any(isinstance(value, Tensor) and value.requires_grad for value in values)
+    )
 
 
 def refuse_second_derivatives() -> None:

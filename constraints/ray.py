@@ -48,13 +48,13 @@ class Ray:
         traced: bool = False,
     ):
         self.action, self.center, self.offset = action, center, offset
-        self.gauge_of, self._traced = gauge_of, traced
+        self._gauge_of, self._traced = gauge_of, traced
         # Of the time when the ray was made, whatever the mode of the first use.
         self._grad_enabled = torch.is_grad_enabled() if traced else offset.requires_grad
 
     @property
     def gauge(self) -> Tensor:
-        """Gauge L (...) of the offset."""
+        """Gauge L (...) of the offset, without gradients; `Constraint.gauge` has them."""
         return self._gauge_and_gradient[0]
 
     @property
@@ -65,7 +65,7 @@ class Ray:
     @cached_property
     def _gauge_and_gradient(self) -> tuple[Tensor, Tensor]:
         with torch.set_grad_enabled(self._grad_enabled):
-            gauge, gradient = self.gauge_of(self.offset)
+            gauge, gradient = self._gauge_of(self.offset)
         return gauge.detach(), gradient
 
     def _differentiable_gauge(self) -> Tensor:
@@ -203,7 +203,7 @@ class Ray:
 
     def _traced_stretch(self, unit: Tensor) -> Tensor:
         """phi (...) of the gauge map at `unit`, as a function of all that is differentiated by; 1 at 0."""
-        gauge = (self.gauge_of(unit)[1] * unit).sum(-1)
+        gauge = (self._gauge_of(unit)[1] * unit).sum(-1)
         at_center = (unit == 0.0).all(-1)
         return torch.where(at_center, 1.0, _largest(unit) / torch.where(at_center, 1.0, gauge))
 
@@ -213,7 +213,7 @@ class Ray:
             offset = self._action64()
             size = offset.abs().amax(-1)
             direction = offset / one_where_zero(size).unsqueeze(-1)
-            gauge, gradient = self.gauge_of(direction)
+            gauge, gradient = self._gauge_of(direction)
             # A NaN gauge stays NaN.
             factor = torch.where(size == 0.0, 1.0, gauge).reciprocal()
             face = box_gauge_gradient(direction, None)

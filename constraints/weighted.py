@@ -16,12 +16,15 @@ from torch import Tensor
 
 from constraints.base import AT_FACE, Constraint, ExplicitSet
 from constraints.coefficients import Bound, BoundCoefficient, Coefficient, Coefficients, flat
+from constraints.errors import ConstraintError
 from constraints.implicit import Boundary
 from constraints.jacobian import JacobianProduct, deflated_jacobian
 from constraints.numerics import one_where_zero, root_or_one, safe_sqrt
 from constraints.scalar_dual import RowProblem
 
-_TINY = 1e-300  # a divisor in the place of 0
+_TINY = 1e-300  # the square of a divisor in the place of 0
+_MOST_WRITTEN = 16  # coordinates of a set whose 2^d rows are written out
+_MOST_COMPARED = 12  # the same where all rows are compared with each other at every action
 
 
 class Weights(NamedTuple):
@@ -32,12 +35,15 @@ class Weights(NamedTuple):
 
 
 class _WeightPatterns(Constraint):
-    """Rows pattern_k * weight(obs), all with the same bound > 0, a number or a function. ValueError for another."""
+    """Rows pattern_k * weight(obs), all with the same bound > 0, a number or a function. ValueError for another.
+
+    `penalty` and `explicit` write out all rows; ConstraintError with more than 16 coordinates and 2^d of them.
+    """
 
     def __init__(self, weight: Coefficients, bound: Bound, dim: int):
         super().__init__(dim)
         self.weight, self.bound = weight, bound
-        self._weight_at, self._bound_at = Coefficient(weight), BoundCoefficient(bound)
+        self._weight_at, self._bound_at = Coefficient("weight", weight, (dim,)), BoundCoefficient("bound", bound)
 
     def _at(self, obs: Tensor) -> Weights:
         return Weights(self._weight_at(obs), self._bound_at(obs))
@@ -133,7 +139,11 @@ class WeightedL1(_WeightPatterns):
 
 
 class WeightedPositivePart(_WeightPatterns):
-    """sum max(w_i a_i, 0) <= bound in the box: 2^d - 1 rows (R+M, H+M, W+M)."""
+    """sum max(w_i a_i, 0) <= bound in the box: 2^d - 1 rows (R+M, H+M, W+M).
+
+    With more than 12 coordinates, `violation` of an action inside the set is that of the nearest of d rows, and not of
+    all: it may be lower, and it is negative all the same. Outside it is exact.
+    """
 
     origin_centered = False
 
@@ -143,13 +153,28 @@ class WeightedPositivePart(_WeightPatterns):
     def _row(self, weight: Tensor, side: Tensor) -> Tensor:
         return weight * (weight * side > 0.0)
 
+    def _violation(self, at: Weights, action: Tensor) -> Tensor:
+        if self.dim <= _MOST_COMPARED:
+            return super()._violation(at, action)
+        # For a point outside the set, the row that it exceeds most is a prefix of the coordinates sorted by a_i / w_i:
+        # where s.w.a > bound, (s.w.a - bound) / |s w| is quasi-convex in the row's s.w.a and |s w|^2, and prefixes are
+        # the corners of what these two can be. For a point inside, the nearest row is a subset-sum problem.
+        weight, bound = at
+        ratio = torch.where(weight == 0.0, -torch.inf, action / weight)
+        order = ratio.argsort(-1, descending=True)
+        weight, action = torch.broadcast_tensors(weight, action)
+        weight, action = weight.gather(-1, order), action.gather(-1, order)
+        norm = root_or_one(weight.square().cumsum(-1))
+        return (((weight * action).cumsum(-1) - bound) / norm).amax(-1)
+
     def _center(self, at: Weights) -> Tensor:
         # Among the rows of all subsets, only prefixes of the weights sorted downwards limit the radius. Many points
         # attain it; this one is continuous in obs.
         weight, bound = at
         ordered = weight.abs().sort(-1, descending=True).values
-        total, norm = ordered.cumsum(-1), safe_sqrt(ordered.square().cumsum(-1))
-        radius = ((bound + total) / (norm + total).clamp(min=_TINY)).amin(-1, keepdim=True).clamp(max=1.0)
+        # Without weights, the quotient is large: the radius is the box's.
+        total, norm = ordered.cumsum(-1), ordered.square().cumsum(-1).clamp(min=_TINY).sqrt()
+        radius = ((bound + total) / (norm + total)).amin(-1, keepdim=True).clamp(max=1.0)
         room = 1.0 - radius
         return -(radius**2 * weight / (2.0 * bound)).clamp(-room, room)
 
@@ -203,8 +228,19 @@ class HalfSpace(_WeightPatterns):
         return -(1.0 - radius) * weight.sign()
 
 
-@functools.lru_cache
 def _all_patterns(entries: tuple[float, float], dim: int, device: torch.device) -> Tensor:
-    """Every pattern (2^dim, dim) of the two entries."""
-    rows = list(itertools.product(entries, repeat=dim))
-    return torch.tensor(rows, dtype=torch.float64, device=device)
+    """Every pattern (2^dim, dim) of the two entries; ConstraintError where they are too many to be written out."""
+    if dim > _MOST_WRITTEN:
+        raise ConstraintError(
+            f"a set of {dim} coordinates has 2^{dim} rows, and penalty and explicit write them out for at most"
+            f" {_MOST_WRITTEN} coordinates; violation(obs, action).clamp(min=0) is a penalty without such a limit"
+        )
+    return _cached_patterns(entries, dim, device)
+
+
+@functools.lru_cache
+def _cached_patterns(entries: tuple[float, float], dim: int, device: torch.device) -> Tensor:
+    # Whatever the mode of the first caller: autograd takes no tensors that were made in inference mode.
+    with torch.inference_mode(False):
+        rows = list(itertools.product(entries, repeat=dim))
+        return torch.tensor(rows, dtype=torch.float64, device=device)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from constraints import Constraint
-from core.config import Config, PenaltyConfig
+from core.config import AUTO, Config, PenaltyConfig
 from core.maps import Map, Placement
 from core.random import Streams
 from core.replay import Batch
@@ -40,6 +40,21 @@ class Agent(Snapshots):
 
     An algorithm declares its settings, its rows of the paper's table and what it supports in class attributes, and
     implements the abstract methods. It is off-policy: it learns from batches of a replay buffer.
+
+    Its contracts, which `algos.check_algorithm` tries out:
+
+    - Random numbers come from `init` in `build`, from `exploration` (with `which=which`) in acting and from
+      `update_noise` in gradient steps, and from nowhere else: the same command gives the same bits.
+    - A learned parameter has k rows a seed (`networks`). Row i starts from numbers of init[i]. Modules are in
+      `networks`, optimisers in `optimizers`. A module that no optimiser trains takes no gradient.
+    - No seed depends on its neighbours: a loss is the mean over the batch and never over seeds, and `explore`,
+      `start_episode` and `start_rollout` change the rows `which` alone.
+    - What the future depends on beside these is in `memory`, so that a resumed training repeats every bit.
+    - Every loss goes through `descend`, so that a divergence ends its seed.
+    - Executed actions, those of `policy` too, come from the map (`feasible`). `policy` is deterministic, and keeps a
+      copy of its parameters.
+    - `statistics` has the same names in every call, a value a seed.
+    - Where gradient steps differ, `update` counts them in `updates`, and `cycle` is their period.
     """
 
     config_class: ClassVar[type[Config]] = Config
@@ -101,7 +116,8 @@ class Agent(Snapshots):
         self.placement = placement
         self.stores_centers = self.map.replays_center(constraint)
         self.penalty_weight = config.penalty if isinstance(config, PenaltyConfig) else None
-        self.device = torch.device(config.device)  # of networks, batches and what `explore` and `policy` are given
+        # Of networks, batches and what `explore` and `policy` are given. Who trains a cell has chosen (`sweep.train`).
+        self.device = torch.device("cpu" if config.device == AUTO else config.device)
         self.exploration = Streams(seeds, "explore", self.device)
         self.update_noise = Streams(seeds, "update", self.device)
         self.updates = 0  # gradient steps so far, where an algorithm counts them (see `cycle`)
@@ -235,8 +251,11 @@ class Agent(Snapshots):
     def diverged(self) -> dict[int, str]:
         """The positions of the seeds with a loss that is not finite, and which. It waits for the device."""
         found: dict[int, str] = {}
+        sums = [losses.sum() for losses in self.losses.values()]
+        if not sums or math.isfinite(torch.stack(sums).sum().item()):  # the common case waits once
+            return found
         for name, losses in self.losses.items():
-            if not math.isfinite(losses.sum().item()):  # the common case costs little
+            if not math.isfinite(losses.sum().item()):
                 finite = losses.isfinite().reshape(-1, len(self.seeds)).all(0)
                 for i in (~finite).nonzero().flatten().tolist():
                     found.setdefault(i, f"{name} loss")

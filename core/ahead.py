@@ -138,7 +138,7 @@ class Ahead:
 
     def _draw_later(self, first: int) -> Future[_Block]:
         # Memory that a copy to the GPU need not wait for. PyTorch gives it to a later block only after that copy.
-        numbers = torch.zeros(self.block.shape, dtype=self._dtype, pin_memory=self.pinned)
+        numbers = torch.empty(self.block.shape, dtype=self._dtype, pin_memory=self.pinned)
         return self.worker.submit(self._draw, first, numbers)
 
     def _draw(self, first: int, numbers: Tensor) -> _Block:

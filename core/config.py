@@ -9,19 +9,27 @@ import math
 import re
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields, make_dataclass
 from typing import Any, NamedTuple
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from core.words import ConfigError
 from store.loggers import CSV, LOGGERS
 
-THREADS = min(torch.get_num_threads(), 4)
-"""The threads of a cell that is alone on the machine: all physical cores (or OMP_NUM_THREADS), but no more than 4, as
-the networks are small."""
+CORES = torch.get_num_threads()
+"""All physical cores, or OMP_NUM_THREADS."""
+THREADS = {"cpu": min(CORES, 4), "cuda": min(CORES, 8)}
+"""What threads=auto is for a cell that is alone on the machine. Its networks are small and fill no more than 4; beside
+a GPU the threads move MuJoCo's robots."""
+AUTO = "auto"
+"""Stands for the fastest choice on the machine that trains."""
+
+
+QUICK_EPISODES = (1, 2)
+"""Episodes of an evaluation, and of the final result, with quick=true. What is learned is the same."""
 
 
 # ---------------------------------------------------------------- how a setting is declared
@@ -96,6 +104,7 @@ class Config:
     eval_every: int = setting(5_000, "environment steps between evaluations", AT_LEAST_ONE)
     eval_episodes: int = setting(5, "episodes of an evaluation", AT_LEAST_ONE)
     final_episodes: int = setting(50, "episodes of the final result", AT_LEAST_ONE)
+    quick: bool = setting(False, "few evaluation episodes, to try something out; part of the run's name")
     # The run itself; none of these changes what is learned, beyond float rounding.
     results: str = setting("results", "folder that results go to")
     overwrite: bool = setting(False, "start again in any case; the old run is kept")
@@ -103,12 +112,16 @@ class Config:
         None, "simulator of the robot, where there is a choice (Reacher: closed-form, pybullet)"
     )
     device: str = setting(
-        "cpu",
-        "of networks and replay buffer: cpu, cuda or cuda:1",
+        AUTO,
+        "of networks and replay buffer: auto (a GPU where there is one), cpu, cuda or cuda:1",
         # Only the machine that trains can tell whether there is such a GPU.
-        Rule(lambda value: bool(re.fullmatch(r"cpu|cuda(:[0-9]+)?", value)), "must be cpu, cuda or cuda:N"),
+        Rule(lambda value: bool(re.fullmatch(r"auto|cpu|cuda(:[0-9]+)?", value)), "must be auto, cpu, cuda or cuda:N"),
     )
-    threads: int = setting(THREADS, "CPU threads (default: a cell alone up to 4, in a sweep 1)", AT_LEAST_ONE)
+    threads: int | str = setting(
+        AUTO,
+        "CPU threads; auto: a cell alone up to 4 (beside a GPU 8), in a sweep 1",
+        Rule(lambda value: value == AUTO or (isinstance(value, int) and value >= 1), "must be auto or at least 1"),
+    )
     checkpoint_every: int = setting(10_000, "environment steps of a seed between checkpoints", AT_LEAST_ONE)
     log: str = setting(
         CSV,
@@ -177,27 +190,36 @@ def split_values(schema: type, key: str, text: str) -> list[str]:
     return list(dict.fromkeys(values))
 
 
-def override(config: DictConfig, schema: type, key: str, text: str, prefix: str = "") -> None:
-    """Set one key of a structured config, the dataclass `schema`; ConfigError where `text` is not of its type.
+def parse_value(schema: type, key: str, text: str, prefix: str = "") -> Any:
+    """The value of one key of the dataclass `schema`; ConfigError where `text` is not of its type.
 
     `prefix` stands before the key on the command line.
     """
     if text in ("null", "None", "~"):
         raise ConfigError(f"bad value {text!r} for {prefix}{key}: a value is needed")
-    name = keys_of(schema)[key].name
-    kind = typing.get_type_hints(schema)[name]
+    kind = typing.get_type_hints(schema)[keys_of(schema)[key].name]
+    kinds = [k for k in typing.get_args(kind) or [kind] if k is not type(None)]
+    if kinds == [str]:
+        return text
+    typed = _typed(kind, text)
+    if typing.get_origin(kind) is tuple:
+        return typed
     try:
-        OmegaConf.update(config, name, _typed(kind, text))
+        # OmegaConf would put something else in the place of ${...} and ???.
+        if "${" not in text and "???" not in text:
+            checked = OmegaConf.structured(make_dataclass("Checked", [("value", kind)]))
+            OmegaConf.update(checked, "value", typed)
+            return vars(OmegaConf.to_object(checked))["value"]
     except OmegaConfBaseException:
-        kinds = [k for k in typing.get_args(kind) or [kind] if k is not type(None)]
-        expected = str(kind) if typing.get_origin(kind) is list else " or ".join(k.__name__ for k in kinds)
-        raise ConfigError(f"bad value {text!r} for {prefix}{key}: expected {expected}") from None
+        pass
+    expected = str(kind) if typing.get_origin(kind) is list else " or ".join(k.__name__ for k in kinds)
+    raise ConfigError(f"bad value {text!r} for {prefix}{key}: expected {expected}")
 
 
 def _typed(kind: Any, text: str) -> object:
     """The text of one override, made ready for the type check of a field of the type `kind`."""
     if typing.get_origin(kind) is tuple:
-        return list(parse_seeds(text))
+        return parse_seeds(text)
     if typing.get_origin(kind) is list:
         return [_whole(part) for part in text.removeprefix("[").removesuffix("]").split(",")]
     return _whole(text) if int in (kind, *typing.get_args(kind)) else text
@@ -214,18 +236,18 @@ def _whole(text: str) -> int | str:
 
 def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
     """`base` with the overrides, type-checked by OmegaConf and range-checked; ConfigError for what does not fit."""
-    schema = type(base)
-    config = OmegaConf.structured(base)
+    config = typing.cast(Config, OmegaConf.to_object(OmegaConf.structured(base)))
+    config.seeds = tuple(config.seeds)  # OmegaConf makes a list of it
+    if parse_value(type(base), "quick", overrides.get("quick", "false")):
+        config.eval_episodes, config.final_episodes = QUICK_EPISODES
     for key, text in overrides.items():
         if key in ("algo", "env"):
             continue
         if key not in keys_that_apply(base):
             raise ConfigError(f"{key} does not apply to {base.algo} on {base.env}")
-        override(config, schema, key, text)
-    resolved = typing.cast(Config, OmegaConf.to_object(config))
-    resolved.seeds = tuple(resolved.seeds)  # OmegaConf makes a list of it
-    _check_ranges(resolved)
-    return resolved
+        setattr(config, keys_of(config)[key].name, parse_value(type(base), key, text))
+    _check_ranges(config)
+    return config
 
 
 def _check_ranges(config: Config) -> None:
@@ -251,7 +273,9 @@ def saved_settings(config: Config, seed: int) -> dict[str, object]:
     """The configuration of one seed as its run folder keeps it, by key."""
     settings = {key: getattr(config, f.name) for key, f in keys_of(config).items()}
     settings |= {"seed": str(seed), "train_freq": str(config.train_freq)}
-    return {key: value for key, value in settings.items() if key not in ("results", "overwrite")}
+    # Runs without `quick` are as those that are older than that setting.
+    left_out = {"results", "overwrite", *(() if config.quick else ("quick",))}
+    return {key: value for key, value in settings.items() if key not in left_out}
 
 
 def restore_settings(schema: type[Config], saved: Mapping[str, Any]) -> Config:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import gymnasium
@@ -16,6 +17,8 @@ from core.random import stream_seed
 StepTogether = Callable[[Sequence[Any], np.ndarray], Sequence[Any]]
 """Steps environments, each with its action (d,) of (environments, d). Returns for each what `step` returns or, for an
 action that it refuses, the error that `step` raises."""
+Watch = Callable[[int], AbstractContextManager[Callable[[int], Any]]]
+"""A context around an evaluation of at most so many steps; its function counts steps."""
 
 
 def refusal(error: Exception, obs: Any) -> str:
@@ -39,7 +42,9 @@ class Evaluator:
         stop_if_asked: Callable[[], None],
     ):
         self.make_env, self.seeds, self.parallel = make_env, seeds, parallel
-        self.step_together, self.stop_if_asked = step_together, stop_if_asked
+        self.step_together, self.ask_to_stop = step_together, stop_if_asked
+        self.watch: Watch = lambda steps: nullcontext(lambda count: None)  # the trainer shows a bar
+        self.advance: Callable[[int], Any] = lambda count: None
         self.envs: dict[int, list[Any]] = {}
         self.refused: dict[int, str] = {}  # position of a seed -> why its policy's action was refused, in the last run
 
@@ -50,14 +55,22 @@ class Evaluator:
         """
         returns, self.refused = [], {}
         before = {i: [env.unwrapped.get_state() for env in self._envs_of(i)] for i in which}
+        starts = range(0, episodes, self.parallel)
+        longest = max(env.unwrapped.robot.max_episode_steps for i in which for env in self._envs_of(i))
         try:
-            for start in range(0, episodes, self.parallel):
-                returns.append(self._together(policy, which, min(self.parallel, episodes - start)))
+            with self.watch(len(starts) * longest) as self.advance:
+                for start in starts:
+                    returns.append(self._together(policy, which, min(self.parallel, episodes - start)))
         except BaseException:
             for i, states in before.items():
                 self.set_state(i, states)
             raise
         return np.concatenate(returns, axis=1)
+
+    def stop_if_asked(self) -> None:
+        """Called before every step of the environments."""
+        self.ask_to_stop()
+        self.advance(1)
 
     def _together(self, policy: Callable[[Tensor], Tensor], which: Sequence[int], count: int) -> np.ndarray:
         envs = [env for i in which for env in self._envs_of(i)[:count]]

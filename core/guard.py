@@ -66,14 +66,14 @@ class Guard:
         def guarded(*args: Any, **kwargs: Any) -> Any:
             result, rows = self._call(method, args, kwargs)
             if isinstance(result, Ray):
-                result.gauge_of = self._guarded_gauge(result, rows, method, args, kwargs)
+                result._gauge_of = self._guarded_gauge(result, rows, method, args, kwargs)
             return result
 
         return guarded
 
     def _guarded_gauge(self, ray: Ray, rows: Sequence[int], method: Callable, args: tuple, kwargs: dict) -> Callable:
         """A ray asks for its gauge later. This guards that as well."""
-        gauge_of = ray.gauge_of
+        gauge_of = ray._gauge_of
 
         def guarded(direction: Tensor) -> tuple[Tensor, Tensor]:
             ask, stand_in = gauge_of, rows
@@ -83,7 +83,7 @@ class Guard:
                 except ConstraintError as error:
                     self._refuse(error, _arguments(method, args, kwargs).arguments["obs"], stand_in)
                     again, stand_in = self._call(method, args, kwargs)
-                    ask = again.gauge_of
+                    ask = again._gauge_of
 
         return guarded
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from tqdm import tqdm
 
 from core.config import Config
+
+EVALUATION_DELAY = 2.0
+"""Seconds after which an evaluation has a bar of its own."""
 
 
 class PhaseTimer:
@@ -44,7 +48,8 @@ class Progress:
 
     def __init__(self, config: Config, steps: Sequence[int], shown: bool):
         self.warm_up = min(config.learning_starts, config.steps)
-        self.name, self.shown = f"{config.algo} {config.env}", shown
+        together = f" ({len(steps)} seeds together)" if len(steps) > 1 else ""
+        self.name, self.shown = f"{config.algo} {config.env}{together}", shown
         done = sum(min(n, self.warm_up) for n in steps)
         self.bars = [
             ("warm-up", self.warm_up * len(steps), done),
@@ -54,17 +59,20 @@ class Progress:
 
     def _next_bar(self) -> tqdm:
         label, total, done = self.bars.pop(0)
+        return self._bar(label, total, initial=done, smoothing=0.1)
+
+    def _bar(self, label: str, total: int, **options: Any) -> tqdm:
         interval = 0.5 if sys.stderr.isatty() else 60.0  # seconds; a log file needs few lines
+        intervals = {"mininterval": interval, "maxinterval": interval}
         return tqdm(
-            total=total,
-            initial=done,
-            desc=f"{self.name} {label}",
-            unit="step",
-            disable=not self.shown,
-            smoothing=0.1,
-            mininterval=interval,
-            maxinterval=interval,
+            total=total, desc=f"{self.name} {label}", unit="step", disable=not self.shown, **intervals, **options
         )
+
+    @contextmanager
+    def evaluation(self, steps: int) -> Iterator[Callable[[int], Any]]:
+        """A bar below the other one while an evaluation of at most `steps` steps lasts, if it does not end at once."""
+        with self._bar("evaluation", steps, leave=False, delay=EVALUATION_DELAY) as bar:
+            yield bar.update
 
     def advance(self, count: int, step: int) -> None:
         """Count `count` environment steps; `step` is how far the seed furthest behind had come."""

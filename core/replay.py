@@ -54,7 +54,8 @@ class Replay:
         self._rows[self.offsets] = 0.0  # a seed that fails at its first step has no transitions and samples this row
         self.everyone = [*range(len(seeds))]
         self.added = [0] * len(seeds)
-        self.sizes = torch.ones(len(seeds), 1, dtype=torch.int64, device=device)  # transitions that each can sample
+        # Transitions that each seed can sample, after `sizes_of` were added.
+        self.sizes, self.sizes_of = torch.ones(len(seeds), 1, dtype=torch.int64, device=device), [0] * len(seeds)
         # Transitions on their way: they go into the buffer, and to the device, in one piece before it is read.
         self.waiting: list[Tensor] = []
         self.places: list[int] = []
@@ -82,12 +83,13 @@ class Replay:
         """Put the transitions that wait into the buffer, without waiting for the device."""
         if self.waiting:
             self._put()
+        if self.sizes_of != self.added:
+            self.sizes.copy_(self._there(torch.tensor(self._sizes()).unsqueeze(1)), non_blocking=True)
+            self.sizes_of = list(self.added)
 
     def _put(self) -> None:
-        count = len(self.places)
-        numbers = self._there(torch.tensor(self.places + self._sizes()))
-        self._rows.index_copy_(0, numbers[:count], self._there(torch.cat(self.waiting)))
-        self.sizes.copy_(numbers[count:].unsqueeze(1))
+        places, rows = self._there(torch.tensor(self.places)), self._there(torch.cat(self.waiting))
+        self._rows.index_copy_(0, places, rows)
         self.waiting, self.places = [], []
 
     def stretch(self, i: int, start: int, stop: int) -> list[Tensor]:

@@ -80,6 +80,7 @@ class Trainer:
         on stderr that names algorithm, task and step.
         """
         self.progress = Progress(self.config, [seed.steps for seed in self.seeds], self.show_progress)
+        self.evaluator.watch = self.progress.evaluation
         try:
             if not self.began:
                 self._sparing(self._begin)
@@ -118,7 +119,10 @@ class Trainer:
     def _fail_refused(self) -> None:
         for i, reason in self.guard.refused.items():
             if not self.seeds[i].ended:
-                self._fail(self.seeds[i], f"the constraint of {self.config.env}: {reason}")
+                self._fail(self.seeds[i], self._of_constraint(reason))
+
+    def _of_constraint(self, reason: str) -> str:
+        return f"the constraint of {self.config.env}: {reason}"
 
     def _report(self, error: Exception) -> None:
         """Say where an error came that ends all seeds, and what is left of the training.
@@ -288,7 +292,7 @@ class Trainer:
         with self.guard.of(which) as refused:
             apart = self.guard.apart(lambda obs: policy(obs.to(self.agent.device)).cpu())
             returns = self.evaluator.run(apart, which, episodes)
-        self.evaluator.refused |= refused
+        self.evaluator.refused |= {i: self._of_constraint(reason) for i, reason in refused.items()}
         return returns
 
     def _finish(self, seeds: Sequence[Seed]) -> None:

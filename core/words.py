@@ -3,22 +3,74 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterable, Mapping
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping
+from typing import TypeVar
+
+Row = TypeVar("Row")
+FEW = 20
+"""With more choices than that, a message that suggests one does not list the others."""
+GROUPS = ("all", "paper")
+"""Names on a command line that stand for several."""
 
 
 class ConfigError(ValueError):
     """A setting that the user can correct. The message is one line that names the value and the choices."""
 
 
+class NameTable(MutableMapping[str, Row]):
+    """A table by names that appear on command lines and in the folders of runs; `kind` says what they name.
+
+    Raises ValueError for a name that exists, because runs are known by it, and for one that cannot be a word, a part of
+    a comma list and a folder. `del` makes a name free again.
+    """
+
+    def __init__(self, kind: str):
+        self.kind, self._rows = kind, dict[str, Row]()
+
+    def __setitem__(self, name: str, row: Row) -> None:
+        if name in self._rows:
+            raise ValueError(f"the {self.kind} {name!r} exists: take another name, or delete it first")
+        if not isinstance(name, str) or not re.fullmatch(r"[^\s,/\\=.][^\s,/\\=]*", name) or name in GROUPS:
+            raise ValueError(
+                f"{name!r} cannot be the name of a {self.kind}: no space, comma, '=' or slash, no leading '.', and none"
+                f" of {', '.join(GROUPS)}"
+            )
+        self._rows[name] = row
+
+    def __ior__(self, rows: Mapping[str, Row]) -> NameTable[Row]:
+        self.update(rows)
+        return self
+
+    def __getitem__(self, name: str) -> Row:
+        return self._rows[name]
+
+    def __delitem__(self, name: str) -> None:
+        del self._rows[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+
 def known_name(kind: str, value: object, choices: Iterable[str]) -> str:
-    """Return `value` if it is one of `choices`. Otherwise raise a ConfigError that names them and the closest one."""
+    """Return `value` if it is one of `choices`. Otherwise raise a ConfigError that names the closest one, or them."""
     choices, text = list(choices), str(value)
     if text in choices:
         return text
+    close = closest(text, choices)
+    hint = f"; did you mean {close}?" if close else ""
+    listed = f" (choices: {', '.join(choices)})" if not close or len(choices) <= FEW else ""
+    raise ConfigError(f"unknown {kind} {text!r}{hint}{listed}")
+
+
+def closest(text: str, choices: Iterable[str]) -> str | None:
+    """The name out of `choices` that a misspelt `text` may mean."""
     by_folded = {choice.casefold(): choice for choice in choices}
     close = difflib.get_close_matches(text.casefold(), by_folded, n=1, cutoff=0.6)
-    hint = f"; did you mean {by_folded[close[0]]}?" if close else ""
-    raise ConfigError(f"unknown {kind} {text!r}{hint} (choices: {', '.join(choices)})")
+    return by_folded[close[0]] if close else None
 
 
 def parse_words(words: Iterable[str], keys: Iterable[str], free: str | None = None) -> dict[str, str]:

@@ -87,11 +87,12 @@ class _Check:
     def formats(self) -> list[Step]:
         """Check what reset and step return, in the first episode; return its steps, that of the reset included."""
         machine = self.new()
-        obs = self.call("reset", machine.reset, _random_numbers())
+        rng = _random_numbers()
+        obs = self.call("reset", machine.reset, rng)
         if isinstance(obs, tuple):
             self.fail(".reset() returns a tuple; it returns the observation alone, without an info")
         self.observation("reset", obs)
-        steps: list[Step] = [(obs.copy(), 0.0, False, {})]
+        steps: list[Step] = [(obs.copy(), rng.random(), False, {})]
         seen, infos = [(obs, obs.copy())], list[dict[str, Any]]()
         for action in self.actions:
             given = action.copy()
@@ -156,8 +157,9 @@ class _Check:
             self.fail(f": {why} (one ends after {len(first)} steps, the other after {len(second)})")
 
     def begin(self, machine: Robot, seed: int = 0, spoil: bool = False) -> Step:
-        obs = self.call("reset", machine.reset, _random_numbers(seed))
-        step: Step = (obs.copy(), 0.0, False, {})
+        rng = _random_numbers(seed)
+        obs = self.call("reset", machine.reset, rng)
+        step: Step = (obs.copy(), rng.random(), False, {})  # that number tells how many were drawn
         if spoil:
             obs[:] = np.nan
         return step

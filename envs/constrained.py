@@ -306,10 +306,13 @@ class ActionConstrainedEnv(gymnasium.Env):
             obs, exact = torch.from_numpy(self._obs), torch.from_numpy(action.astype(np.float64))
             exact = self.constraint.project(obs, exact)
             action, violation = exact.numpy(), self.constraint.violation(obs, exact).item()
-        if not violation <= TOLERANCE:  # a NaN is refused as well
+        allowed = TOLERANCE
+        if violation > TOLERANCE and self.constraint.on_empty == "least":
+            allowed += self.constraint.least_violation(torch.from_numpy(self._obs)).item()
+        if not violation <= allowed:  # a NaN is refused as well
             return InfeasibleActionError(
                 f"{self._where()}: action {action} violates the constraint by {violation:.3g} "
-                f"(at most {TOLERANCE:g} is allowed)"
+                f"(at most {allowed:g} is allowed)"
             )
         self.largest_violation = max(self.largest_violation, violation)
         return action

@@ -104,9 +104,11 @@ class Tasks(MutableMapping[str, Task]):
         if name in self._rows:
             raise ValueError(f"there is a task {name} already; take another name, or del envs.TASKS[{name!r}] first")
         identifier = gymnasium_id(name)
-        if identifier in gymnasium.registry:
+        before = gymnasium.registry.get(identifier)
+        if before is not None and before.kwargs.get("task") != name:
             other = next((other for other in self._rows if gymnasium_id(other) == identifier), "another package")
             raise ValueError(f"the task {name} would have the identifier {identifier}, which {other} has already")
+        gymnasium.registry.pop(identifier, None)  # this row, where the module is loaded for the second time
         gymnasium.register(
             identifier,
             entry_point="envs.constrained:ActionConstrainedEnv",

@@ -44,7 +44,7 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     - None: suggestions have to be feasible. Others raise InfeasibleActionError.
 
     `info` of each step has `suggested_action` and `executed_action`, both normalised, float64 (d,), and `violation`,
-    that of the suggestion (`Constraint.violation`; feasible where <= 0).
+    a NumPy float64, that of the suggestion (`Constraint.violation`; feasible where <= 0).
 
     `constraint` is on normalised actions; `constraints.InUnits` makes one of a constraint in the units of `env`. It
     sees the observations of `env` as float64 (n,). A wrapper that changes observations goes around this one, or else
@@ -103,8 +103,8 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         scaled = np.clip((self._middle + self._half * executed).astype(self._box.dtype), self._box.low, self._box.high)
         obs, reward, terminated, truncated, info = self.env.step(scaled)
         self._see(obs)
-        info = {**info, "suggested_action": suggested, "executed_action": executed, "violation": violation}
-        return obs, float(reward), terminated, truncated, info
+        own = {"suggested_action": suggested, "executed_action": executed, "violation": np.float64(violation)}
+        return obs, float(reward), terminated, truncated, {**info, **own}
 
     def _feasible(self, suggested: np.ndarray) -> tuple[np.ndarray, float]:
         """The feasible action (d,) of a suggestion (d,), and the suggestion's violation."""

@@ -117,13 +117,17 @@ def _draw_training(
             line = line_of(curve.algo, own, points) | {"linestyle": curve.style}
             _draw_curve(first, learning_curve(curve.runs), line | {"label": curve.label})
             for axes, measure in zip(others, measures, strict=False):
-                points_of = [(run.training["step"], run.training[measure]) for run in curve.runs if run.training]
+                points_of = [
+                    (run.training["step"], run.training[measure]) for run in curve.runs if measure in run.training
+                ]
                 _draw_curve(axes, mean_curve(points_of), line)
         _label_axes(first, "Evaluation return")
         for axes, measure in zip(others, measures, strict=False):
             _label_measure(axes, measure)
         for axes in others[len(measures) :]:
             axes.remove()
+        for axes in (first, *others[: len(measures)]):
+            axes.tick_params(labelbottom=True)  # sharing leaves them to the last row, where a column may have no panel
     figure.suptitle(fill(", ".join([f"{task} (mean ± standard error)", *common]), 110))
     longest = max(len(curve.label) for curve in curves)
     figure.legend(loc="outside lower center", ncols=max(1, min(len(curves), 100 // (longest + 8))), frameon=False)

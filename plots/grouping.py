@@ -152,15 +152,16 @@ def list_left_out(groups: Groups) -> list[str]:
 
 
 def list_diverged(groups: Groups) -> list[str]:
-    """A line for each seed that diverged and counts with the best parameters before, after one for its cell."""
+    """A line for each cell with seeds that diverged, and count with the best parameters before."""
     lines = []
     for condition in chain.from_iterable(order_conditions(groups)):
         for algo in order_algos(groups[condition]):
             runs = groups[condition][algo]
             if count := count_diverged(runs):
-                lines.append(f"{condition.label} {algo}: {count} of {len(runs)} seeds diverged; best parameters before")
-                failed = [run for run in runs if run.failure and math.isfinite(final_return(run))]
-                lines += [f"    seed {run.seed} {describe_failure(run.failure)}" for run in failed]
+                diverged = [run for run in runs if run.failure and math.isfinite(final_return(run))]
+                which = "; ".join(f"seed {run.seed} {describe_failure(run.failure)}" for run in diverged)
+                said = f"{count} of {len(runs)} seeds diverged; best parameters before"
+                lines.append(f"{condition.label} {algo}: {said}: {which}")
     return lines
 
 

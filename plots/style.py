@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -11,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from plots.paper import COLORS, FAMILIES
+from store.folder import LONGEST_NAME
 
 FORMATS = ("png", "pdf")
 LATER = {"DGauge": ("#b5a100", "solid"), "SGauge": ("#ff6f61", "dashed")}
@@ -68,6 +71,8 @@ def save(figure: Figure, folder: Path, name: str, formats: Sequence[str]) -> lis
     """Save as `folder/name` in the `formats` of figures. Characters that are awkward in a file name become _."""
     folder.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"[^\w+,=.\[\]-]+", "_", name)
+    if len(os.fsencode(name)) > LONGEST_NAME - len(".png"):  # with a checksum, as the names of runs are told apart
+        name = f"{name[:50]},{hashlib.sha256(name.encode()).hexdigest()[:12]}"
     paths = [folder / f"{name}.{suffix}" for suffix in formats if suffix in FORMATS]
     for path in paths:
         # The whole benchmark has dozens of figures: compress lightly, and compute each layout once for both formats.

@@ -19,7 +19,7 @@ import sys
 import textwrap
 import tokenize
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
 from pathlib import PurePath
 from typing import Any
@@ -141,7 +141,8 @@ class _Describer:
         elif isinstance(value, types.MethodType):
             self.found[path] = f"method {value.__func__.__qualname__}"
             self.add(f"{path}.self", value.__self__)
-            self.add(f"{path}.function", value.__func__)
+            if not is_project(module_of(value.__func__)):
+                self.add(f"{path}.function", value.__func__)
         elif isinstance(function := inspect.unwrap(value) if callable(value) else None, types.FunctionType):
             self._function(path, function)
         elif isinstance(value, _FUNCTIONS) or not (hasattr(value, "__dict__") or hasattr(type(value), "__slots__")):
@@ -155,7 +156,13 @@ class _Describer:
         attributes = _attributes(value)
         if is_project(module_of(type(value))):
             # What it was made with. Other attributes, such as results that it keeps, follow from that.
-            attributes = _arguments(value, attributes) or attributes
+            public = {name: item for name, item in attributes.items() if not name.startswith("_")}
+            attributes = _arguments(value, attributes) or public
+        elif not is_user(type(value)):
+            attributes = _library_state(value, attributes)
+        else:
+            kept = _internals(type(value))
+            attributes = {name: item for name, item in attributes.items() if name not in kept}
         for name, item in attributes.items():
             self.add(f"{path}.{name}", item)
 
@@ -253,6 +260,33 @@ def _attributes(value: Any) -> dict[str, Any]:
     return {name: getattr(value, name) for name in slots if hasattr(value, name)} | dict(getattr(value, "__dict__", {}))
 
 
+def _parameters(kinds: Iterable[type]) -> dict[str, None]:
+    """The names of the constructors' arguments, each once."""
+    names: dict[str, None] = {}
+    for kind in kinds:
+        if "__init__" in vars(kind) and kind is not object:
+            names |= dict.fromkeys(inspect.signature(vars(kind)["__init__"]).parameters)
+    return names
+
+
+def _internals(kind: type) -> set[str]:
+    """Private attributes in which the project's bases of a user's class keep something, such as a count of calls."""
+    bases = [base for base in kind.__mro__ if is_project(module_of(base))]
+    used = {name for base in bases for name in re.findall(r"\bself\.(_\w+)", _source(base))}
+    return used - {f"_{name}" for name in _parameters(bases)}
+
+
+def _library_state(value: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a network; of another library's object the public numbers and texts, as the rest may change."""
+    if hasattr(value, "state_dict"):
+        return dict(value.state_dict())
+    return {
+        name: item
+        for name, item in attributes.items()
+        if not name.startswith("_") and isinstance(item, (*_PLAIN, np.ndarray))
+    }
+
+
 def _slots_of(base: type) -> Iterator[str]:
     slots = vars(base).get("__slots__", ())
     yield from (name for name in ((slots,) if isinstance(slots, str) else slots) if not name.startswith("__"))
@@ -260,12 +294,8 @@ def _slots_of(base: type) -> Iterator[str]:
 
 def _arguments(value: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
     """The attributes that have the names of the constructors' arguments; empty where one of those has no attribute."""
-    names: dict[str, None] = {}
-    for base in type(value).__mro__:
-        if "__init__" in vars(base) and base is not object:
-            names |= dict.fromkeys(inspect.signature(vars(base)["__init__"]).parameters)
     found = {}
-    for name in names:
+    for name in _parameters(type(value).__mro__):
         attribute = next((attribute for attribute in (name, f"_{name}") if attribute in attributes), None)
         if attribute:
             found[name] = attributes[attribute]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,17 +20,33 @@ def replace_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
         with open(temporary, "wb") as file:
             write(file)
             file.flush()
-            os.fsync(file.fileno())
+            _sync(file.fileno())
         temporary.replace(path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # so that the new name survives a crash
-        finally:
-            os.close(folder)
+        _sync_folder(path.parent)  # so that the new name survives a crash
     except OSError as error:
         with suppress(OSError):
             temporary.unlink()  # it would take space on a full disk
         raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _sync_folder(path: Path) -> None:
+    try:
+        folder = os.open(path, os.O_RDONLY)
+    except PermissionError:  # one may write into it and not list it
+        return
+    try:
+        _sync(folder)
+    finally:
+        os.close(folder)
+
+
+def _sync(descriptor: int) -> None:
+    """Wait until the content is on disk, where the file system can tell. Some cannot, of folders or at all."""
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EBADF, errno.ENOSYS, errno.EOPNOTSUPP, errno.EACCES, errno.EPERM):
+            raise
 
 
 def one_line(error: Exception) -> str:

@@ -3,7 +3,8 @@
     results/<task>/<variant>/seed=<n>/
         config.yaml      the resolved configuration
         definition.json  what the task and the algorithm stood for, as text; see store/definition.py
-        info.json        versions, git commit, machine, threads, command, start time; again for each resumption
+        info.json        versions, git commit, machine, threads, the command that ran, the words of the cell, the user's
+                         own sources with their checksums, start time; again for each resumption
         evaluations.csv  step,return_mean,return_1,...,return_k,seconds: one row an evaluation, appended
         training.csv     step, the algorithm's own measures (losses, entropy, ...), and those of core/suggestions.py
         best.pt last.pt  state dicts
@@ -16,12 +17,14 @@
     results/sweep/       logs and records of sweeps: see sweep/cells.py
 
 `<variant>` is the algorithm's name followed by `,key=value` for each setting that differs from the paper's
-(`DPre+`, `SRad,learning_starts=10000,steps=50000`). Folders moved aside are called `seed=<n>.old-<i>`;
-readers ignore them, and nothing here deletes a run.
+(`DPre+`, `SRad,learning_starts=10000,steps=50000`). Where that is longer than a file system allows, the folder is
+called `SRad,settings=<checksum>`, and config.yaml has the whole text as `variant`. Folders moved aside are called
+`seed=<n>.old-<i>`; readers ignore them, and nothing here deletes a run.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -37,6 +40,8 @@ import yaml
 from store.files import one_line, replace_file
 from store.loggers import Loggers
 
+LONGEST_NAME = 255
+"""Bytes in the name of a folder, at most."""
 _TABLES = ("evaluations.csv", "training.csv")
 # libyaml's loader is some ten times faster, which matters for two thousand runs. Not every wheel has it.
 _YamlLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -49,6 +54,14 @@ def variant_name(algo: str, overrides: Mapping[str, Any]) -> str:
         for key, value in sorted(overrides.items())
     }
     return ",".join([algo, *(f"{key}={value}" for key, value in values.items())])
+
+
+def variant_folder(variant: str) -> str:
+    """The folder of `variant`: its name, or where that is too long for a file system, a short name with a checksum."""
+    if len(os.fsencode(variant)) <= LONGEST_NAME:
+        return variant
+    digest = hashlib.sha256(variant.encode()).hexdigest()[:12]
+    return f"{parse_variant(variant)[0]},settings={digest}"
 
 
 def parse_variant(variant: str) -> tuple[str, dict[str, str]]:
@@ -236,6 +249,8 @@ class RunWriter:
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Write `result.json`, which marks the run as finished. Arrays become lists of numbers."""
+        if self.config.get("quick"):
+            result = {**result, "quick": True}
         self._replace("result.json", json.dumps(result, indent=2, default=methodcaller("tolist")) + "\n")
         self.loggers.log_result(float(result["return_mean"]))
 
@@ -291,8 +306,8 @@ def find_runs(root: str | Path) -> list[Path]:
 def read_run(folder: str | Path) -> Run:
     """Read a run, finished or in progress. Raises a ValueError that names a missing or corrupt file."""
     folder = Path(folder)
-    variant = folder.parent.name
-    algo, overrides = parse_variant(variant)
+    config = _parse(folder / "config.yaml", lambda text: yaml.load(text, _YamlLoader))
+    algo, overrides = parse_variant(str(config.get("variant", folder.parent.name)))
     result = None
     if is_finished(folder):
         result = _parse(folder / "result.json", json.loads)
@@ -307,10 +322,10 @@ def read_run(folder: str | Path) -> Run:
         folder=folder,
         task=folder.parent.parent.name,
         algo=algo,
-        variant=variant,
+        variant=folder.parent.name,
         overrides=overrides,
         seed=int(folder.name.removeprefix("seed=")),
-        config=_parse(folder / "config.yaml", lambda text: yaml.load(text, _YamlLoader)),
+        config=config,
         evaluations=_read_evaluations(folder / "evaluations.csv"),
         training=_read_training(folder / "training.csv"),
         result=result,

@@ -1,13 +1,16 @@
-"""Turns SIGINT, SIGTERM, SIGUSR1 and SIGUSR2 into an exception at the next safe point of the training loop."""
+"""Turns SIGINT, SIGTERM, SIGHUP, SIGUSR1 and SIGUSR2 into an exception at the next safe point of the training loop."""
 
 from __future__ import annotations
 
 import signal
 import threading
+import time
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
-"""Ctrl-C, `kill`, and the signals that batch systems can send before a job's time limit."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+"""Ctrl-C, `kill`, a terminal that closes, and the signals that batch systems can send before a job's time limit."""
+SAME_EVENT = 1.0
+"""Seconds after the first signal in which others belong to it: `timeout` and shells send theirs twice."""
 
 
 class Interrupted(Exception):
@@ -21,12 +24,14 @@ class Interrupted(Exception):
 class Interrupts:
     """While this context is open, the first of SIGNALS is only noted; `stop_if_asked` then raises Interrupted.
 
-    A second signal has its usual effect: it ends the process at once. In a thread other than the main one, where
-    Python allows no handlers, signals keep their usual effect.
+    A second signal has its usual effect: it ends the process at once. That does not hold for signals within SAME_EVENT
+    of the first, and for SIGHUP, which a closing terminal repeats. In a thread other than the main one, where Python
+    allows no handlers, signals keep their usual effect.
     """
 
     def __init__(self) -> None:
         self.signum: int | None = None
+        self._noted = 0.0  # time.monotonic() of the first signal
         self._previous: dict[int, object] = {}
 
     def __enter__(self) -> Interrupts:
@@ -43,8 +48,11 @@ class Interrupts:
         self._previous = {}
 
     def _note(self, signum: int, frame: FrameType | None) -> None:
-        self.signum = signum
-        self.__exit__()
+        if self.signum is None:
+            self.signum, self._noted = signum, time.monotonic()
+        elif signum != signal.SIGHUP and time.monotonic() - self._noted > SAME_EVENT:
+            self.__exit__()
+            signal.raise_signal(signum)
 
     def stop_if_asked(self) -> None:
         """Raise Interrupted if a signal came."""

@@ -18,16 +18,15 @@ def is_project(module: str) -> bool:
     return module.partition(".")[0] in _PROJECT
 
 
-@cache
 def user_file(module: str) -> Path | None:
     """The source file of a loaded module that is neither the project's nor a library's; None for those two."""
     file = getattr(sys.modules.get(module), "__file__", None)
     if is_project(module) or not file:
         return None
     path = Path(file).resolve()
-    if path.suffix != ".py" or path in _commands() or any(folder in path.parents for folder in _libraries()):
+    if path in _commands() or any(folder in path.parents for folder in _libraries()):
         return None
-    return path
+    return path if path.is_file() and path.suffix == ".py" else None  # some modules invent the name of a file
 
 
 def module_of(value: Any) -> str:
@@ -38,7 +37,11 @@ def module_of(value: Any) -> str:
 def is_user(value: Any) -> bool:
     """Whether a function or a class is the user's own code. One that was typed at a prompt is, too."""
     module = module_of(value)
-    return user_file(module) is not None or (module == "__main__" and not _main_is_command())
+    if is_project(module) or not module:
+        return False
+    if module == "__main__":
+        return not _main_is_command()
+    return module not in sys.modules or user_file(module) is not None
 
 
 def user_files() -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import re
 import shlex
@@ -15,11 +16,16 @@ from typing import Any
 
 import torch
 
+from store.origin import ROOT, user_files
+
 _PACKAGES = ("numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omegaconf")
 
 
 def describe_environment(command: Sequence[str]) -> dict[str, Any]:
-    """The content of `info.json`: versions, git commit, command, start time. It names no path of this machine."""
+    """The content of `info.json`: versions, git commit, command, start time, and the user's sources that are loaded.
+
+    It names no path of this machine.
+    """
     # PyTorch itself names its build (+cpu, +cu130), which the metadata of a package may leave out.
     versions: dict[str, str | None] = {"python": platform.python_version(), "torch": torch.__version__}
     for package in _PACKAGES:
@@ -27,13 +33,13 @@ def describe_environment(command: Sequence[str]) -> dict[str, Any]:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             versions[package] = None
-    described = _git_describe()
+    described = _git_describe(Path(__file__))
     return {
         "versions": versions,
         "commit": described and described.removesuffix("-dirty"),
         "dirty": described and described.endswith("-dirty"),
-        # An absolute path, alone or after `key=`, is cut to its last part.
-        "command": shlex.join(re.sub(r"(^|=)/.*/(?=.)", r"\1", word) for word in command),
+        "command": command_line(command),
+        "sources": _describe_sources(user_files()),
         "platform": platform.platform(),
         "processor": processor(),
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -49,16 +55,49 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def _git_describe() -> str | None:
-    """The commit of this code, plus `-dirty` if tracked files are changed; None outside a repository."""
+def command_line(words: Sequence[str]) -> str:
+    """The words as a shell takes them. An absolute path, alone or after `key=`, is cut to its last part."""
+    return shlex.join(re.sub(r"(^|=|,)/[^,]*/(?=[^,])", r"\1", word) for word in words)
 
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(Path(__file__).parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.strip()
 
+def _describe_sources(files: Sequence[Path]) -> list[dict[str, Any]]:
+    """Name, checksum and commit of each of `files`, without those that the commit of this code includes.
+
+    A file that no repository has, has no commit. `dirty` tells whether it differs from its commit.
+    """
+    inside = [str(file) for file in files if file.is_relative_to(ROOT)]
+    try:
+        tracked = _git(Path(__file__), "ls-files", "--full-name", "--", *inside).splitlines() if inside else []
+    except (OSError, subprocess.SubprocessError):
+        tracked = []
+    sources = []
+    for file in files:
+        name = str(file.relative_to(ROOT)) if str(file) in inside else file.name
+        if str(file) in inside and name in tracked:
+            continue
+        described = _git_describe(file)
+        sources.append(
+            {
+                "file": name,
+                "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+                "commit": described and described.removesuffix("-dirty"),
+                "dirty": described and _git(file, "status", "--porcelain", "--", file.name) != "",
+            }
+        )
+    return sources
+
+
+def _git_describe(file: Path) -> str | None:
+    """The commit of the repository that has `file`, plus `-dirty` if tracked files are changed; None without one."""
     try:
         # If the package is installed in an environment inside another repository, git would describe that one.
-        git("ls-files", "--error-unmatch", Path(__file__).name)
-        return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+        _git(file, "ls-files", "--error-unmatch", file.name)
+        return _git(file, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
     except (OSError, subprocess.SubprocessError):
         return None
+
+
+def _git(file: Path, *arguments: str) -> str:
+    """What git says in the folder of `file`. Raises OSError or SubprocessError."""
+    command = ["git", "-C", str(file.parent), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.strip()

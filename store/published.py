@@ -133,7 +133,7 @@ def _read_task(folder: Path) -> list[PublishedRun]:
             task=folder.name,
             algo=row["algo"],
             variant=row["variant"],
-            overrides=parse_variant(row["variant"])[1],
+            overrides=parse_variant(str(config.get("variant", row["variant"])))[1],
             seed=int(row["seed"]),
             config=config,
             evaluations=_evaluations(evaluations.get(key, [])),

@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from algos import ALGORITHMS, PAPER, paper_settings, setting_keys
-from core.config import Config, differences, keys_that_apply, resolve, split_values
+from core.config import Config, differences, keys_that_apply, resolve, saved_settings, split_values
 from core.words import ConfigError, known_name, parse_words, split_names
 from envs import TASKS
 from store.files import replace_file
-from store.folder import parse_variant, run_folder, variant_name
+from store.folder import parse_variant, run_folder, variant_folder, variant_name
 from sweep.exit import Exit
+from sweep.plugins import load_plugins, plugin_words
 
 RECORDS = "sweep"
 """The folder of logs and records in that of results."""
@@ -96,7 +97,7 @@ class Cell(CellFolders):
         return cls(
             root=Path(config.results).expanduser(),
             task=config.env,
-            variant=variant_name(config.algo, differences(config, paper)),
+            variant=variant_folder(variant_name(config.algo, differences(config, paper))),
             seeds=config.seeds,
             config=config,
             paper=paper,
@@ -107,17 +108,27 @@ class Cell(CellFolders):
         return _cell_of, (self.words,)
 
     @property
+    def full_variant(self) -> str:
+        """The algorithm and all of its settings that differ from the paper's, however long that is."""
+        return variant_name(self.config.algo, differences(self.config, self.paper))
+
+    def settings(self, seed: int) -> dict[str, object]:
+        """What config.yaml of a seed's run has."""
+        named = {} if self.variant == self.full_variant else {"variant": self.full_variant}
+        return saved_settings(self.config, seed) | named
+
+    @property
     def words(self) -> list[str]:
         """The words after `run.py` that train this cell alone."""
         config = self.config
         words = {"algo": config.algo, "env": config.env, "seed": format_seeds(self.seeds)}
-        words |= parse_variant(self.variant)[1]
+        words |= parse_variant(self.full_variant)[1]
         words |= {"results": str(self.root.absolute()), "overwrite": json.dumps(config.overwrite)}
         words |= {"device": config.device, "threads": str(config.threads)}
         words |= {"checkpoint_every": str(config.checkpoint_every), "log": config.log}
         if config.simulator is not None:
             words["simulator"] = config.simulator
-        return [f"{key}={value}" for key, value in words.items()]
+        return [*plugin_words(), *(f"{key}={value}" for key, value in words.items())]
 
 
 def paper_config(name: str, task: str) -> Config:
@@ -165,13 +176,13 @@ def _combinations(paper: Config, settings: Mapping[str, str]) -> Iterator[dict[s
 
 
 def _cell_of(words: Sequence[str]) -> Cell:
-    (cell,) = make_cells(parse_words(words, setting_keys()))
+    (cell,) = make_cells(parse_words(load_plugins(words), setting_keys()))
     return cell
 
 
 def shorten(cells: Sequence[CellFolders]) -> tuple[list[str], str]:
     """The cells' variants without the settings that all of them share, and these settings."""
-    variants = [parse_variant(cell.variant) for cell in cells]
+    variants = [parse_variant(cell.full_variant if isinstance(cell, Cell) else cell.variant) for cell in cells]
     shared = set.intersection(*(set(settings.items()) for _, settings in variants))
     names = [variant_name(algo, dict(settings.items() - shared)) for algo, settings in variants]
     return names, " ".join(f"{key}={value}" for key, value in sorted(shared))

@@ -102,7 +102,9 @@ def _check_algorithm(config: Config, constraint: Constraint, obs: Tensor) -> Non
     """Act, evaluate and learn at obs (seeds, batch, n)."""
     algorithm: Algorithm = ALGORITHMS[config.algo]
     small = replace(config, hidden=[4] * len(config.hidden), batch_size=BATCH)
-    alone, agent = (algorithm.build(small, constraint, obs.shape[-1], list(range(n))) for n in (1, SEEDS))
+    alone, agent = (
+        algorithm.build(small, constraint, obs.shape[-1], seeds) for seeds in ([SEEDS - 1], list(range(SEEDS)))
+    )
     try:
         check_parameters(config.algo, alone, agent)
     except ContractError as error:

@@ -53,6 +53,15 @@ def _rates() -> dict[tuple[str, str], Rate]:
     return {(row["task"], row["algo"]): Rate(float(row["update_ms"]), float(row["step_ms"])) for row in rows}
 
 
+def is_measured(task: str, algo: str) -> bool:
+    """Whether `_rate` is a measurement of this task, and of this algorithm or one of its family.
+
+    The time of a task of one's own depends most on its set, which can take a hundred times as long as another one.
+    """
+    families = {ALGORITHMS[name].agent.family for _, name in _rates() if name in ALGORITHMS}
+    return task in {name for name, _ in _rates()} and ALGORITHMS[algo].agent.family in families
+
+
 @cache
 def _rate(task: str, algo: str) -> Rate:
     """The measured rate of a cell. Without one: the mean over cells of the same robot and family of algorithms."""
@@ -104,7 +113,8 @@ def corrections(runs: Iterable[Run], device: str) -> dict[tuple[str, str], float
         if run.result is None or run.task not in TASKS or run.algo not in ALGORITHMS:
             continue
         try:
-            config = saved_config(run.config | {"env": run.task, "algo": run.algo})
+            # (runs that are older than the choice of a device were on the CPU)
+            config = saved_config({"device": "cpu"} | run.config | {"env": run.task, "algo": run.algo})
             took, seeds = float(run.result["seconds"]["total"]), int(run.result["seeds_in_lockstep"])
             steps = int(run.result["gradient_steps"])
         except (KeyError, TypeError, ValueError):

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from core.config import AUTO
 from core.words import ConfigError
 from sweep.cells import Cell
 from sweep.definition import check_definitions
@@ -13,22 +14,23 @@ from sweep.exit import Exit
 from sweep.local import run_queue
 from sweep.plan import describe_plan, make_plan, memory_warning
 from sweep.settings import Sweep
-from sweep.slurm import check_gpus, submit
+from sweep.slurm import asks_for_gpus, check_gpus, submit
 from sweep.states import job_states
-from sweep.train import check_device, check_log, make_env
+from sweep.train import check_device, check_log, make_env, on_this_machine
 
 
-def launch(sweep: Sweep, cells: Sequence[Cell], threads_given: bool, stop_if_asked: Callable[[], None]) -> Exit:
+def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None]) -> Exit:
     """Plan the cells, and print the plan or carry it out.
 
-    `threads_given` says that the user has chosen the threads of a cell; `stop_if_asked` raises Interrupted after a
-    signal. Raises ConfigError for settings that the user can correct.
+    `stop_if_asked` raises Interrupted after a signal. Raises ConfigError for settings that the user can correct.
     """
     on_slurm = sweep.settings.launcher == "slurm"
     jobs = sweep.slurm.parallel if on_slurm else sweep.settings.jobs or 1
-    if not threads_given:
-        threads = sweep.slurm.cpus if on_slurm else 1
-        cells = [Cell.of(replace(cell.config, threads=threads)) for cell in cells]
+    threads = sweep.slurm.cpus if on_slurm else 1
+    if on_slurm and cells[0].config.device == AUTO:  # the machine that submits does not tell
+        device = "cuda" if asks_for_gpus(sweep) else "cpu"
+        cells = [Cell.of(replace(cell.config, device=device)) for cell in cells]
+    cells = [Cell.of(on_this_machine(cell.config, threads)) for cell in cells]
     settings = cells[0].config  # one command has one device, and overwrites all cells or none
     if not on_slurm:
         check_log(settings.log)

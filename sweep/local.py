@@ -47,7 +47,7 @@ class Queue:
                 if self.stopping:
                     return None
                 cell.record("end").unlink(missing_ok=True)
-                with open(path, "a") as log:
+                with open(path, "a", encoding="utf-8", errors="backslashreplace") as log:
                     print(f"+ {' '.join(command)} # {datetime.now():%Y-%m-%d %H:%M:%S}", file=log, flush=True)
                     # A session of its own: a terminal sends Ctrl-C to every process of its session, and the signal of
                     # `stop` would then be the second one, which ends the process without a checkpoint.

@@ -15,11 +15,15 @@ from tables import Table, text_cells, to_terminal
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """One cell of the plan; `factor` corrects the estimates of its time."""
+    """One cell of the plan; `factor` corrects the estimates of its time.
+
+    Where `timed` is False, nothing like it was ever measured. The estimate then only serves the order of the cells.
+    """
 
     cell: Cell
     state: CellState
     factor: float
+    timed: bool
 
     def seconds(self, start: int) -> float:
         """Estimated time of the training from step `start` on, on one core."""
@@ -52,7 +56,9 @@ def make_plan(cells: Sequence[Cell], jobs: Mapping[str, str]) -> list[Entry]:
         state = state_of(cell, jobs)
         if cell.config.overwrite and not state.stage.taken:
             state = CellState(Stage.NEW, detail="starts again")
-        entries.append(Entry(cell, state, estimates.correct(factors, cell.config.env, cell.config.algo)))
+        name = cell.config.env, cell.config.algo
+        timed = name in factors or estimates.is_measured(*name)
+        entries.append(Entry(cell, state, estimates.correct(factors, *name), timed))
     return sorted(entries, key=lambda entry: -entry.remaining)
 
 
@@ -65,7 +71,7 @@ def describe_plan(entries: Sequence[Entry], jobs: int) -> str:
             name,
             format_seeds(entry.cell.seeds),
             entry.state.describe(),
-            estimates.in_words(entry.remaining) if entry.remaining else "–",
+            _time_left(entry),
             f"{entry.memory / 1e9:.1f} GB" if entry.remaining else "–",
         )
         for entry, name in zip(entries, names, strict=True)
@@ -79,21 +85,35 @@ def describe_plan(entries: Sequence[Entry], jobs: int) -> str:
         records=[],
     )
     left = [entry for entry in entries if entry.remaining]
-    work = [entry.remaining for entry in left]
+    work = [entry.remaining for entry in left if entry.timed]
     states = [entry.state for entry in entries]
     lines = [to_terminal(table, bold=False, width=None), count_states(states)]
     lines += list_details([entry.cell for entry in entries], states)
     if left:
         memory = _largest_memory(entries, jobs)
-        jobs = min(jobs, len(left))
+        jobs, unknown = min(jobs, len(left)), len(left) - len(work)
+        if unknown:
+            lines.append(
+                f"note: the time of {unknown} cell{'s' * (unknown > 1)} is unknown, as nothing like that was measured;"
+                " once a run of it has finished in this folder, that tells"
+            )
         if left[0].cell.config.device != "cpu":
             lines.append("note: the estimates are for the CPU; GPUs are not measured")
+        if not work:
+            lines.append(f"estimate: up to {memory / 1e9:.1f} GB of memory")
+            return "\n".join(lines)
         lines.append(
-            f"estimate: {estimates.in_words(sum(work))} on one core in all;"
+            f"estimate{' without these' if unknown else ''}: {estimates.in_words(sum(work))} on one core in all;"
             f" {estimates.in_words(estimates.makespan(work, jobs))} with {jobs} cell{'s' * (jobs > 1)} at a time,"
             f" on a core each, in up to {memory / 1e9:.1f} GB of memory"
         )
     return "\n".join(lines)
+
+
+def _time_left(entry: Entry) -> str:
+    if not entry.remaining:
+        return "–"
+    return estimates.in_words(entry.remaining) if entry.timed else "unknown"
 
 
 def memory_warning(entries: Sequence[Entry], jobs: int) -> str:

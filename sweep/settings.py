@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
-from omegaconf import OmegaConf
-
 from algos import setting_keys
-from core.config import override
+from core.config import parse_value
 from core.words import ConfigError, known_name, parse_words
+from sweep.plugins import KEY
 
 SLURM_PREFIX = "slurm."
 LAUNCHERS = ("local", "slurm")
@@ -24,7 +22,7 @@ class SlurmSettings:
 
     partition: str | None = field(default=None, metadata={"help": "partition (default: the cluster's)"})
     gpus: int = field(default=0, metadata={"help": "GPUs a cell"})
-    cpus: int = field(default=1, metadata={"help": "CPUs a cell, and threads where threads= is not given"})
+    cpus: int = field(default=1, metadata={"help": "CPUs a cell, and its threads where threads= is not given"})
     hours: float = field(default=24.0, metadata={"help": "time limit; a longer cell is requeued and resumes"})
     parallel: int = field(default=256, metadata={"help": "cells running at the same time, at most"})
 
@@ -59,26 +57,22 @@ def parse_sweep(words: Sequence[str]) -> tuple[Sweep, dict[str, str]]:
     """
     own = [f.name for f in fields(SweepSettings)]
     slurm_names = [f.name for f in fields(SlurmSettings)]
-    settings, slurm = OmegaConf.structured(SweepSettings), OmegaConf.structured(SlurmSettings)
+    settings, slurm = SweepSettings(), SlurmSettings()
     sbatch: dict[str, str] = {}
     cells: dict[str, str] = {}
-    keys = [*setting_keys(), *own, *(SLURM_PREFIX + name for name in slurm_names)]
+    keys = [*setting_keys(), KEY, *own, *(SLURM_PREFIX + name for name in slurm_names)]
     given = parse_words(words, keys, free=SLURM_PREFIX)
     for key, text in given.items():
         name = key.removeprefix(SLURM_PREFIX)
         if key in own:
-            override(settings, SweepSettings, key, text)
+            setattr(settings, key, parse_value(SweepSettings, key, text))
         elif not key.startswith(SLURM_PREFIX):
             cells[key] = text
         elif name in slurm_names:
-            override(slurm, SlurmSettings, name, text, SLURM_PREFIX)
+            setattr(slurm, name, parse_value(SlurmSettings, name, text, SLURM_PREFIX))
         else:
             sbatch[name.replace("_", "-")] = text
-    sweep = Sweep(
-        typing.cast(SweepSettings, OmegaConf.to_object(settings)),
-        typing.cast(SlurmSettings, OmegaConf.to_object(slurm)),
-        sbatch,
-    )
+    sweep = Sweep(settings, slurm, sbatch)
     _check_values(sweep, [key for key in given if key.startswith(SLURM_PREFIX)])
     return sweep, cells
 

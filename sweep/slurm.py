@@ -26,6 +26,7 @@ from store.checkpoint import saved_step
 from store.files import one_line
 from store.folder import has_ended
 from store.lock import LockedError, run_lock
+from store.output import forgiving_output
 from sweep.cells import RECORDS, Cell
 from sweep.exit import Exit, exit_code, stoppable
 from sweep.plan import Entry, make_plan
@@ -47,12 +48,15 @@ PAUSES = (2.0, 8.0)
 # ------------------------------------------------------------------------------------------------------- submission
 
 
+def asks_for_gpus(sweep: Sweep) -> bool:
+    # sbatch has other parameters that ask for GPUs, and some clusters require them.
+    return sweep.slurm.gpus > 0 or any(name.startswith(("gpus", "gres", "tres")) for name in sweep.sbatch)
+
+
 def check_gpus(sweep: Sweep, device: str) -> None:
     """Raise ConfigError if the jobs get GPUs that they do not use, or use GPUs that they do not get."""
     gpus = sweep.slurm.gpus
-    # sbatch has other parameters that ask for GPUs, and some clusters require them.
-    asked = gpus or any(name.startswith(("gpus", "gres", "tres")) for name in sweep.sbatch)
-    if device != "cpu" and not asked:
+    if device != "cpu" and not asks_for_gpus(sweep):
         raise ConfigError(f"device={device} with launcher=slurm needs slurm.gpus= of at least 1")
     if ":" in device:
         raise ConfigError(
@@ -182,7 +186,8 @@ class Job:
         requeue: Any = signal.signal(signum, lambda *_: None)
         log, before = environment.paths.stderr, self._progress()
         try:
-            code = exit_code(partial(stoppable, partial(train_cells, [self.cell])))
+            with forgiving_output():
+                code = exit_code(partial(stoppable, partial(train_cells, [self.cell])))
         except Exception:
             self.cell.note_end(1, log)
             raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,20 +14,22 @@ import torch
 
 import envs
 from algos import ALGORITHMS, setting_keys
-from core.config import RUN_KEYS, Config, saved_settings
+from core.config import AUTO, RUN_KEYS, THREADS, Config
 from core.trainer import Trainer
-from core.words import ConfigError, parse_words
+from core.words import ConfigError, known_name, parse_words
 from envs import TASKS
 from store.checkpoint import Checkpoint, CheckpointFolder, FormatError, group_checkpoints
 from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
 from store.interrupt import Interrupted
 from store.lock import run_lock
 from store.loggers import MissingPackageError, check_loggers, logger_names
-from store.provenance import describe_environment
+from store.output import forgiving_output
+from store.provenance import command_line, describe_environment
 from sweep.cells import Cell, make_cells
 from sweep.check import check_training
 from sweep.definition import check_definition, define
 from sweep.exit import Exit, stoppable
+from sweep.plugins import load_plugins, refuse_to_train_in_plugin
 
 
 def train_words(words: str) -> bool:
@@ -36,9 +39,11 @@ def train_words(words: str) -> bool:
     program; the same call resumes. Raises ConfigError for wrong words, ConstraintError for a constraint that breaks
     down and LockedError if another process trains a run.
     """
-    cells = make_cells(parse_words(words.split(), setting_keys()))
+    refuse_to_train_in_plugin()
+    cells = make_cells(parse_words(load_plugins(words.split()), setting_keys()))
     try:
-        return stoppable(partial(train_cells, cells)) is Exit.DONE
+        with forgiving_output():
+            return stoppable(partial(train_cells, cells)) is Exit.DONE
     except Interrupted as interrupted:
         raise SystemExit(128 + interrupted.signum) from None
 
@@ -54,9 +59,9 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
 
     Prints each result and its folder. Returns whether every seed has a result.
     """
-    config, folders = cell.config, dict(zip(cell.seeds, cell.folders, strict=True))
+    config, folders = on_this_machine(cell.config), dict(zip(cell.seeds, cell.folders, strict=True))
     definition = define(config.env, config.algo)  # before its objects are used, which may change them
-    torch.set_num_threads(config.threads)
+    torch.set_num_threads(int(config.threads))
     check_log(config.log)
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
@@ -79,20 +84,20 @@ def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
         for seed in sorted(ended):
             print(f"{folders[seed]}: {_end_of(folders[seed])} (overwrite=true starts it again and keeps this one)")
         groups, fresh = ([], list(folders)) if config.overwrite else _find_checkpoints(folders, ended)
-        info = describe_environment(["run.py", *cell.words])
-        info |= {"threads": config.threads, "device": _device_name(config.device)}
+        info = describe_environment(sys.orig_argv[1:])
+        info |= {"cell": command_line(cell.words), "threads": config.threads, "device": _device_name(config.device)}
         for group in groups:
             if ended.issuperset(group):  # the process died after the last seed's end
                 for seed in group:
                     CheckpointFolder(folders[seed]).remove()
             else:
-                _resume(config, folders, group, ended, info, definition, stop_if_asked)
+                _resume(cell, folders, group, ended, info, definition, stop_if_asked)
         if fresh:
             info["lockstep"] = fresh
             writers = [
                 RunWriter(
                     folders[seed],
-                    saved_settings(config, seed),
+                    cell.settings(seed),
                     info,
                     config.eval_episodes,
                     replace_finished=config.overwrite,
@@ -129,6 +134,20 @@ def make_trainer(
         ) from error
 
 
+def on_this_machine(config: Config, threads: int | None = None) -> Config:
+    """`config` with the device and the threads for which "auto" stands here; `threads` for a cell that is not alone.
+
+    Both change the rounding of what is learned, and the chaos of training makes another run of it.
+    """
+    device = config.device
+    if device == AUTO:
+        gpu_pays = torch.cuda.is_available() and not TASKS[config.env].constraint.solved_on_cpu
+        device = "cuda" if gpu_pays else "cpu"
+    if config.threads == AUTO:
+        config = replace(config, threads=threads or THREADS[torch.device(device).type])
+    return replace(config, device=device)
+
+
 def check_device(name: str) -> None:
     """Raise ConfigError if PyTorch cannot compute on the device `name`."""
     choices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -155,9 +174,15 @@ def make_env(task: str, simulator: str | None) -> envs.ActionConstrainedEnv:
 
 
 def check_robot(task: str) -> None:
-    """Raise ConfigError if the robot of `task` does not keep the protocol of `envs.Robot` in a few steps."""
+    """Raise ConfigError if the robot of `task` does not keep the protocol of `envs.Robot` in a few steps.
+
+    So it does if no algorithm has hyperparameters for the group that the robot names.
+    """
+    robot = envs.TASKS[task].robot
+    groups = {group: None for algorithm in ALGORITHMS.values() for group in algorithm.agent.paper}
+    known_name(f"hyperparameters of {robot.__name__}", robot.hyperparameters, groups)
     try:
-        envs.check_robot(TASKS[task].robot, steps=10)
+        envs.check_robot(robot, steps=10)
     except envs.RobotError as error:
         raise ConfigError(f"the robot of {task} does not work: {error}") from error
 
@@ -189,7 +214,7 @@ def _find_checkpoints(folders: dict[int, Path], ended: set[int]) -> tuple[list[d
 
 
 def _resume(
-    config: Config,
+    cell: Cell,
     folders: dict[int, Path],
     group: dict[int, Checkpoint],
     ended: set[int],
@@ -198,22 +223,23 @@ def _resume(
     stop_if_asked: Callable[[], None],
 ) -> None:
     """Resume the training from the checkpoints of `group`, which were written together."""
-    before = next(iter(group.values())).group
+    config, before = cell.config, next(iter(group.values())).group
     # Seeds that have ended stay in the batch, which keeps its shape. If other seeds are missing, it changes anyway.
     seeds = list(before) if set(before) == set(group) else [seed for seed in group if seed not in ended]
     for seed in seeds:
-        _check_settings(folders[seed], group[seed].settings, saved_settings(config, seed))
+        _check_settings(folders[seed], group[seed].settings, cell.settings(seed))
     writers = []
     for seed in seeds:
         resumed = info | {"step": group[seed].step, "lockstep": seeds}
-        settings = saved_settings(config, seed)
+        settings = cell.settings(seed)
         writers.append(RunWriter.resume(folders[seed], settings, resumed, config.eval_episodes, definition))
         if seed not in ended:
             print(f"{folders[seed]}: resuming from step {group[seed].step}")
     if len(seeds) < len(before):
         print(f"(trained with other seeds before, {len(before)} in all: equal up to rounding to an unbroken run)")
-    if (threads := group[seeds[0]].settings["threads"]) != config.threads:
-        print(f"(threads={config.threads} now, {threads} before: equal up to rounding to an unbroken run)")
+    for key, now in (("threads", config.threads), ("device", config.device)):
+        if (earlier := group[seeds[0]].settings[key]) != now:
+            print(f"({key}={now} now, {earlier} before: equal up to rounding to an unbroken run)")
     trainer = make_trainer(config, seeds, writers, True, stop_if_asked)
     trainer.restore([group[seed] for seed in seeds])
     _run(trainer)
@@ -250,7 +276,8 @@ def _run(trainer: Trainer) -> None:
         else:
             print(
                 f"{folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
-                f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e})"
+                f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e}"
+                f"{'; quick=true, for comparison too few' if trainer.config.quick else ''})"
             )
 
 

@@ -120,6 +120,7 @@ def test_results_folders_that_cannot_be_written(capsys, monkeypatch, tmp_path, r
 def test_an_end_that_cannot_be_read_is_not_run_over(capsys, tmp_path, name, content):
     folder = tmp_path / "R+N" / VARIANT / "seed=0"
     folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text("algo: DPre\n")
     (folder / name).write_text(content)
     run_command(f"algo=DPre env=R+N {WORDS} results={tmp_path}".split())
     out = capsys.readouterr().out
@@ -139,17 +140,28 @@ def ones(obs, *shape):
 
 
 CONSTRAINTS = {
-    "weights of another dimension": (lambda: WeightedL1(lambda obs: obs[..., :3], 1.0, 2), "size of tensor a (3)"),
+    "weights of another dimension": (
+        lambda: WeightedL1(lambda obs: obs[..., :3], 1.0, 2),
+        "weight(obs) has shape (1, 3), expected (..., 2) with ... = (1,)",
+    ),
     "weights that are NaN": (
         lambda: WeightedL1(lambda obs: obs[..., :2] * torch.nan, 1.0, 2),
-        "it projects (1, ..., 1) to [[nan, nan]]",
+        "sample 0: weight(obs) is NaN or infinite",
     ),
     "weights that are no tensor": (lambda: WeightedPositivePart(lambda obs: "x", 1.0, 2), "str"),
     "an index beyond the observation": (
         lambda: HalfSpace(lambda obs: obs[..., [60, 70]], 1.0, 2),
         "index 60 is out of bounds",
     ),
-    "a matrix of another dimension": (lambda: PlanarEllipse(lambda obs: torch.eye(3), 0.1), "size of tensor"),
+    "a matrix of another dimension": (
+        lambda: PlanarEllipse(lambda obs: torch.eye(3), 0.1),
+        "matrix(obs) has shape (3, 3), expected (..., 2, 2)",
+    ),
+    "a matrix that is an upper triangle": (
+        lambda: PlanarEllipse(lambda obs: torch.tensor([[1.0, 0.5], [0.0, 1.0]]), 0.1),
+        "matrix(obs) is not symmetric",
+    ),
+    "a bound that is negative": (lambda: Ball(lambda obs: -obs[..., 0].abs() - 1.0, 2), "bound(obs) is not positive"),
     "no rows": (lambda: LinearConstraint(dim=2), "LinearConstraint needs A(obs)"),
     "no bounds": (lambda: LinearConstraint(A=lambda obs: ones(obs, 1, 2), dim=2), "LinearConstraint needs b(obs)"),
     "rows that are NaN": (lambda: rows(lambda o: torch.nan * ones(o, 1, 2), lambda o: ones(o, 1)), "NaN or infinite"),
@@ -178,7 +190,9 @@ def test_constraint_definitions(capsys, tmp_path, monkeypatch, name):
 @pytest.mark.parametrize(
     "make, said",
     [
-        (lambda: Ball(3.0, 2), "got 3.0"),
+        (lambda: Ball(torch.inf, 2), "got inf"),
+        (lambda: Ball(torch.nan, 2), "got nan"),
+        (lambda: WeightedL1(lambda obs: obs, torch.nan, 2), "finite, got nan"),
         (lambda: Ball(0.0, 2), "got 0.0"),
         (lambda: WeightedL1(lambda obs: obs, 0.0, 2), "bound must be positive"),
         (lambda: HalfSpace(lambda obs: obs, -1.0, 2), "bound must be positive"),

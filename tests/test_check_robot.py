@@ -135,6 +135,16 @@ class Remembers(Stateless):
         return obs
 
 
+class DrawsMoreAtFirst(Stateless):
+    """Its observations do not show that the first reset draws more random numbers than the later ones."""
+
+    def reset(self, rng):
+        obs = super().reset(rng)
+        if not hasattr(self, "noise"):
+            self.noise = rng.uniform(size=3)
+        return obs
+
+
 class OnTheClass(Good):
     speed = [0.0]
 
@@ -272,6 +282,7 @@ MISTAKES = {
     "noise": (Noise, "Noise: two robots given the same random numbers and actions differ"),
     "global random numbers": (GlobalNoise, "draw all random numbers from reset's rng (they differ at step 0)"),
     "earlier episodes": (Remembers, "Remembers: an episode depends on earlier ones"),
+    "number of draws": (DrawsMoreAtFirst, "DrawsMoreAtFirst: an episode depends on earlier ones"),
     "state on the class": (OnTheClass, "OnTheClass: a robot changes when another one steps"),
     "state incomplete": (Incomplete, "an episode goes on differently; get_state() leaves something out"),
     "obs of set_state": (WrongObsFromState, "an episode goes on differently"),
@@ -325,6 +336,14 @@ def test_training_names_the_mistake_before_it_starts(mistake, tmp_path, capsys, 
     line = capsys.readouterr().err
     assert line.startswith("run.py: the robot of bad does not work: ") and said in line and line.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_a_group_of_hyperparameters_that_no_algorithm_has(tmp_path, capsys, monkeypatch):
+    robot = type("Misspelt", (Good,), {"hyperparameters": "Hoper"})
+    monkeypatch.setitem(envs.TASKS, "misspelt", envs.Task(robot, Ball(0.1, 1), "", "", 100))
+    assert run_command(f"algo=DPre env=misspelt results={tmp_path}".split()) == 2
+    line = capsys.readouterr().err
+    assert "unknown hyperparameters of Misspelt 'Hoper'; did you mean Hopper?" in line and line.count("\n") == 1
 
 
 # ---------------------------------------------------------------- robots from Gymnasium

@@ -28,8 +28,8 @@ class BreaksOracle(Ball):
 
 
 class BreaksGauge(Ball):
-    def _gauge_gradients(self, obs, direction, center):
-        return [direction @ torch.eye(3, dtype=direction.dtype)]
+    def _gauge_and_gradient(self, at, direction, center):
+        return direction @ torch.eye(3, dtype=direction.dtype), direction
 
 
 class OneAxis(LinearConstraint):
@@ -140,7 +140,7 @@ def test_maps_and_algorithms_of_ones_own(tmp_path, monkeypatch, capsys, agent, m
 def test_a_robot_whose_state_cannot_be_saved(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(TASKS, "R+X", Task(RobotCannotBeSaved, Ball(0.5, 2), "", "", 20))
     assert run_command(["algo=DPre", *WORDS.split(), f"results={tmp_path}"]) == 2
-    assert "the state of R+X's environment cannot be saved in a checkpoint: " in capsys.readouterr().err
+    assert "the robot of R+X does not work: RobotCannotBeSaved.get_state() returns [1.0]" in capsys.readouterr().err
 
 
 def test_an_error_in_an_algorithms_own_code_keeps_its_traceback(tmp_path, monkeypatch):

@@ -121,7 +121,7 @@ def test_lists_and_all_make_the_product():
 def test_the_papers_hyperparameters():
     """Spot checks of Table "Hyperparameters used in the experiments", through the resolution of cells."""
     cells = {(c.algo, c.env): c for c in configs(["algo=all", "env=all"])}
-    assert len(cells) == 13 * len(ALGORITHMS)
+    assert len(cells) == len(TASKS) * len(ALGORITHMS)
     assert [config.algo for config in configs(["algo=paper", "env=R+N"])] == list(PAPER) and len(PAPER) == 13
     nfw, srad = cells["NFW", "R+L2"], cells["SRad", "R+L2"]
     assert (nfw.gamma, nfw.batch_size, nfw.buffer_size, nfw.fw_learning_rate) == (0.98, 100, 200_000, 0.05)

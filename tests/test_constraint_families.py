@@ -18,6 +18,7 @@ from constraints import (
     Box,
     DiagonalEllipse,
     HalfSpace,
+    Intersection,
     PlanarEllipse,
     WeightedL1,
     WeightedL1AndEllipse,
@@ -28,7 +29,7 @@ numbers = st.one_of(
     st.sampled_from([0.0, 1.0, -1.0, 0.5, 1e-6, 1e3, -1e6]), st.floats(-10.0, 10.0, allow_subnormal=False)
 )
 NEAR = 1e-7  # rows of 1e6 beside a bound of 0.05 hold a point to some 1e-9
-bounds = st.sampled_from([0.05, 0.3, 1.0, 10.0])
+bounds = st.sampled_from([0.05, 0.3, 1.0, 1.7, 10.0])
 
 
 def first(obs):
@@ -65,8 +66,8 @@ FAMILIES = {
     "half-space": (12, lambda d, b: HalfSpace(first, b, d), lambda w, s, b: reference(lambda w: w[None], b, w)),
     "ball": (
         12,
-        lambda d, b: Ball(min(b, 1.0), d),
-        lambda w, s, b: reference(no_rows, b, w, np.eye(len(w)), min(b, 1.0)),
+        lambda d, b: Ball(b, d),
+        lambda w, s, b: reference(no_rows, b, w, np.eye(len(w)), b),
     ),
     "ellipse": (
         12,
@@ -152,3 +153,47 @@ def test_gradients_are_never_nan(name, data):
         leaf = x.clone().requires_grad_()
         (gradient,) = torch.autograd.grad(function(obs, leaf).sum(), leaf)
         assert gradient.isfinite().all(), function.__name__
+
+
+def test_a_center_without_weights_is_the_origin():
+    for make in (WeightedPositivePart, HalfSpace):
+        for bound in (0.05, 0.3, 5.0):
+            assert torch.equal(make(first, bound, 3).center(torch.zeros(2, 6)), torch.zeros(2, 3))
+
+
+@every_family
+def test_bounds_that_are_functions_of_the_observation(name):
+    """Each sample has the set of its own number, in every method and written out."""
+    largest, build, _ = FAMILIES[name]
+    if name == "box":
+        return  # it has no bound
+    dim = min(largest, 4)
+    generator = torch.Generator().manual_seed(0)
+    obs, action = (torch.randn(3, n, generator=generator).double() for n in (2 * dim, dim))
+    numbers = torch.tensor([0.3, 0.9, 1.6], dtype=torch.float64)
+    by_function = build(dim, lambda obs: numbers.expand(obs.shape[:-1]))
+    general = Intersection(by_function)
+    log_prob, std = action.sum(-1), torch.full_like(action, 0.5)
+    methods = {
+        "violation": lambda c, k: c.violation(obs[k], action[k]),
+        "penalty": lambda c, k: c.penalty(obs[k], action[k]),
+        "project": lambda c, k: c.project(obs[k], action[k]),
+        "linear_oracle": lambda c, k: c.linear_oracle(obs[k], action[k]),
+        "center": lambda c, k: c.center(obs[k]),
+        "gauge": lambda c, k: c.gauge(obs[k], action[k], 0.9 * c.center(obs[k])),
+        "alpha_map": lambda c, k: c.alpha_map(obs[k], action[k]),
+        "radial_map": lambda c, k: c.radial_map(obs[k], action[k]),
+        "gauge_map": lambda c, k: c.gauge_map(obs[k], action[k].tanh()),
+        "radial_log_prob": lambda c, k: c.radial_log_prob(obs[k], action[k], log_prob[k]),
+        "gauge_log_prob": lambda c, k: c.gauge_log_prob(obs[k], action[k].tanh(), log_prob[k]),
+        "alpha_log_prob": lambda c, k: c.alpha_log_prob(obs[k], action[k], 0.5 * action[k], std[k]),
+    }
+    for method, call in methods.items():
+        batch = call(by_function, slice(None))
+        for k, number in enumerate(numbers.tolist()):
+            torch.testing.assert_close(batch[k], call(build(dim, number), k), rtol=1e-9, atol=1e-9, msg=method)
+    for method in ("violation", "project"):
+        whole = slice(None)
+        torch.testing.assert_close(
+            methods[method](by_function, whole), methods[method](general, whole), rtol=0.0, atol=1e-7
+        )

@@ -166,29 +166,6 @@ def general(learned: Tensor) -> dict[str, Constraint]:
 
 
 @pytest.mark.parametrize("name", ["rows", "ellipse", "intersection"])
-def test_general_sets_refuse_what_they_would_cut(name):
-    """The solvers' results have no gradients with respect to the coefficients; without a graph all works."""
-    theta = torch.ones((), dtype=torch.float64)
-    obs, action = torch.ones(4, 2, dtype=torch.float64), 0.9 * torch.ones(4, 2, dtype=torch.float64, requires_grad=True)
-    calls = [
-        lambda constraint, obs: constraint.project(obs, action),
-        lambda constraint, obs: constraint.center(obs),
-        lambda constraint, obs: constraint.linear_oracle(obs, action.detach()),
-    ]
-    for call in calls:
-        assert call(general(theta)[name], obs).isfinite().all()
-        learned = general(theta.clone().requires_grad_())[name]
-        with pytest.raises(RuntimeError, match="no gradient with respect to") as error:
-            call(learned, obs)
-        assert "\n" not in str(error.value)
-        with torch.no_grad():
-            assert call(learned, obs).isfinite().all()
-    if name != "ellipse":
-        with pytest.raises(RuntimeError, match="no gradient with respect to"):
-            general(theta)[name].project(obs.clone().requires_grad_(), action).sum().backward()
-
-
-@pytest.mark.parametrize("name", ["rows", "ellipse", "intersection"])
 def test_general_sets_have_those_of_violation_penalty_and_gauge(name):
     obs = torch.tensor([[0.7, 0.1], [1.2, 0.3]], dtype=torch.float64, requires_grad=True)
     action = torch.tensor([[0.9, 0.4], [0.8, 0.9]], dtype=torch.float64, requires_grad=True)
@@ -322,6 +299,18 @@ def test_jacrev(name):
                 torch.testing.assert_close(exact[k], expected, msg=f"{method}, argument {argument}")
                 alone = torch.func.jacrev(function, argnums=argument)(obs[k], action[k])
                 torch.testing.assert_close(alone, expected, msg=f"{method}, argument {argument}")
+
+
+def test_what_has_no_transforms_says_so():
+    constraint, obs, action = with_fixed_sets("ellipse")
+    std = torch.ones_like(action)
+    for function, what in (
+        (constraint.linear_oracle, "linear_oracle"),
+        (lambda o, a: constraint.radial_log_prob(o, a, a.sum(-1)), "the density of the radial map"),
+        (lambda o, a: constraint.alpha_log_prob(o, a, a, std[0]), "the density of the alpha map"),
+    ):
+        with pytest.raises(RuntimeError, match=f"{what} has no torch.func transforms"):
+            torch.func.vmap(function)(obs, action)
 
 
 def test_vmap_of_general_sets():

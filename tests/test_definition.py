@@ -69,6 +69,12 @@ class Slow(Reacher):
     max_episode_steps = 10
 
 
+def network(weight):
+    layer = torch.nn.Linear(2, 1, bias=False)
+    torch.nn.init.constant_(layer.weight, weight)
+    return layer
+
+
 def l1(weight):
     return WeightedL1(weight, 0.3, 2)
 
@@ -111,12 +117,24 @@ def other_project():
         (Rows(torch.zeros(2, 50)), Rows(torch.zeros(2, 50).index_fill(1, torch.tensor(7), 1.0)), "checksum"),
         (Rows(np.zeros(2)), Rows(np.ones(2)), "[0.0, 0.0] then, [1.0, 1.0] now"),
         (Project(), other_project(), "the value: Project then, other_project.<locals>.Project2 now"),
+        (network(1.0), network(2.0), "the value's weight: [[1.0, 1.0]] then, [[2.0, 2.0]] now"),
         ({"a": 1, "b": (2, 3)}, {"a": 1, "b": (2, 4)}, "the value[b]: 2, 3 then, 2, 4 now"),
     ],
 )
 def test_what_differs_is_said(before, now, said):
     assert said in differences(describe({"value": before}), describe({"value": now}))
     assert differences(describe({"value": before}), describe({"value": before})) == ""
+
+
+def test_a_definition_does_not_depend_on_what_was_done_with_it():
+    values = [*(TASKS[name].constraint for name in ("R+M", "R+T", "H+O+S")), Rows(torch.eye(2)), l1(scaled(2.0))]
+    values.append(Intersection(Ball(0.5, 2), Rows(torch.eye(2))))
+    for value in values:
+        before = describe({"value": value})
+        obs = torch.randn(4, 17)
+        for method in (value.project, value.linear_oracle, value.violation, value.alpha_map):
+            method(obs, torch.randn(4, value.dim))
+        assert differences(before, describe({"value": value})) == ""
 
 
 def test_globals_count(monkeypatch):
@@ -142,7 +160,7 @@ def test_comments_and_blank_lines_do_not_count(tmp_path):
     for i, code in enumerate(codes):
         path = tmp_path / f"m{i}.py"
         path.write_text(code)
-        namespace = {"__name__": "__main__"}
+        namespace = {"__name__": "nowhere"}
         exec(compile(code, str(path), "exec"), namespace)
         found.append(describe({"value": namespace["f"]})["value"])
     assert found[0] == found[1] == "def f(x):\n    return x"

@@ -8,10 +8,27 @@ from helpers import CHECKPOINTED, Breaks, assert_identical, break_off, outcome, 
 
 from store import folder as results
 from store.checkpoint import Checkpoint, CheckpointFolder
+from store.files import replace_file
 
 
 def no_space(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("refuses", [os.path.isdir, lambda path: True], ids=["folders", "everything"])
+@pytest.mark.parametrize("code", [errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP])
+def test_file_systems_that_know_no_fsync(tmp_path, monkeypatch, refuses, code):
+    def fsync(descriptor):
+        if refuses(os.readlink(f"/proc/self/fd/{descriptor}")):
+            raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    replace_file(tmp_path / "a", lambda file: file.write(b"text"))
+    assert (tmp_path / "a").read_bytes() == b"text" and os.listdir(tmp_path) == ["a"]
+    monkeypatch.setattr(os, "fsync", no_space)
+    with pytest.raises(OSError, match="No space left"):
+        replace_file(tmp_path / "a", lambda file: file.write(b"more"))
+    assert os.listdir(tmp_path) == ["a"]
 
 
 @pytest.mark.parametrize("failing", ["state-3.pt", "state-4.pt", "replay-"])

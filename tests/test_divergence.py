@@ -13,7 +13,7 @@ import envs
 from algos import ALGORITHMS
 from core.random import stream_seed
 from envs import ActionConstrainedEnv
-from plots.grouping import count_failed, group_runs, list_left_out
+from plots.grouping import count_diverged, count_failed, group_runs, list_diverged, list_left_out
 from store.folder import read_results, read_run
 from store.interrupt import Interrupted
 
@@ -101,10 +101,11 @@ def test_a_failed_run_is_reported_and_not_run_again_unless_asked(tmp_path, monke
     assert said in capsys.readouterr().err
     runs, problems = read_results(tmp_path)
     assert problems == [] and len(runs) == 3
-    (line,) = list_left_out(groups := group_runs(runs)[0])
-    assert line.endswith("DPre: seed 5 failed at step 86: critic loss is not finite")
+    (line,) = list_diverged(groups := group_runs(runs)[0])
+    assert "DPre: 1 of 3 seeds diverged; best parameters before: seed 5 failed at step 86: critic loss" in line
+    assert list_left_out(groups) == []
     ((cell,),) = [by_algo.values() for by_algo in groups.values()]
-    assert count_failed(cell) == 1
+    assert (count_failed(cell), count_diverged(cell)) == (0, 1)
     failed = read_run(folder)
     assert failed.failure["step"] == 86 and not failed.finished and failed.evaluations.step.tolist() == [60]
     assert not (folder / "checkpoint").exists() and (folder / "last.pt").is_file()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from helpers import CHECKPOINTED, train
 
 import envs
 from core.evaluation import Evaluator
@@ -68,3 +69,12 @@ def test_episodes_stepped_together_return_what_single_steps_do(task, spoiled):
     for env in robots:
         env.close()
     evaluator.close()
+
+
+def test_a_long_evaluation_has_a_bar_of_its_own(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("core.progress.EVALUATION_DELAY", 0.0)
+    train(tmp_path, CHECKPOINTED.replace("eval_episodes=1", "eval_episodes=2"))
+    err = capsys.readouterr().err
+    assert "DPre R+N (2 seeds together) training" in err
+    # The longest episodes of Reacher have 150 steps; one final episode of each seed, side by side.
+    assert "DPre R+N (2 seeds together) evaluation" in err and "/150 [" in err

@@ -11,6 +11,7 @@ from scipy.optimize import linprog
 from torch import Tensor
 
 from constraints import Constraint, ConstraintError, Intersection, LinearConstraint, QuadraticConstraint
+from constraints.general.scaled_sets import scale_sets
 
 
 def fixed(rows: Tensor, bounds: Tensor) -> LinearConstraint:
@@ -119,7 +120,7 @@ def test_free_joints_stay_at_zero():
 
 def largest_radius(constraint: Constraint, obs: Tensor) -> list[float]:
     """By SciPy, a sample at a time."""
-    sets = constraint._scaled_sets(obs, obs.shape[:-1])
+    sets = scale_sets(constraint.explicit(obs), obs.shape[:-1])
     solid = (sets.rows != 0.0).any(-1, keepdim=True).double()
     objective = [0.0] * constraint.dim + [-1.0]
     return [

@@ -565,6 +565,12 @@ def test_center_on_the_boundary_raises(constraint):
 
 
 def test_misuse():
+    with pytest.raises(
+        TypeError, match=r"an intersection is of constraints, got list; pass them one by one: Intersection\(a, b\)"
+    ):
+        Intersection([Box(2), Box(2)])
+    with pytest.raises(TypeError, match=r"^an intersection is of constraints, got float$"):
+        Intersection(Box(2), 0.3)
     with pytest.raises(ValueError, match="at least one"):
         Intersection()
     with pytest.raises(ValueError, match="different dimensions"):

@@ -20,8 +20,8 @@ def script(code):
 
 def test_a_second_signal_ends_the_process_at_once():
     done = script(
-        "import os, signal\n"
-        "from store.interrupt import Interrupted, Interrupts\n"
+        "import os, signal, time\n"
+        "from store.interrupt import SAME_EVENT, Interrupted, Interrupts\n"
         "with Interrupts() as interrupts:\n"
         "    interrupts.stop_if_asked()\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
@@ -30,9 +30,15 @@ def test_a_second_signal_ends_the_process_at_once():
         "    except Interrupted as interrupted:\n"
         "        print('noted', interrupted.signum, flush=True)\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    print('the same event', flush=True)\n"
+        "    time.sleep(SAME_EVENT + 0.1)\n"
+        "    os.kill(os.getpid(), signal.SIGHUP)\n"
+        "    print('hung up', flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
         "    print('never', flush=True)\n"
     )
-    assert done.returncode == -signal.SIGTERM and done.stdout.split() == ["noted", "15"]
+    assert done.returncode == -signal.SIGTERM
+    assert done.stdout.splitlines() == ["noted 15", "the same event", "hung up"]
 
 
 def test_handlers_are_put_back_and_an_ignored_signal_stays_ignored():
@@ -74,7 +80,7 @@ def test_a_first_ctrl_c_ends_a_command_that_does_not_train():
     assert done.stdout.split() == ["130"]
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_exit_code_says_which_signal(tmp_path, capsys, monkeypatch, signum, unbroken):
     check = Breaks(77, error=Interrupted(signum))
     monkeypatch.setattr(Interrupts, "stop_if_asked", lambda self: check())

@@ -102,3 +102,24 @@ def test_the_distributions_of_the_streams():
     for row in uniform:
         assert -1 <= row.min() < -0.999 and 0.999 < row.max() < 1
         assert row.mean().abs() < 0.02 and (row.std() - 3**-0.5).abs() < 0.01
+
+
+def test_transitions_on_their_way_are_in_the_buffer_whenever_it_is_read():
+    for count in (1, 4, 5, 6, 17):
+        replay = filled([4, 7], [count, count - 1], capacity=5)
+        assert bool(replay.waiting) == bool(count % 5)
+        for i, added in enumerate((count, count - 1)):
+            numbers = range(max(0, added - 5), added)
+            views = replay.stretch(i, numbers.start, numbers.stop)
+            assert torch.cat([view[:, 0] for view in views]).tolist() == [100.0 * i + number for number in numbers]
+        assert not replay.waiting
+
+
+def test_the_device_knows_how_much_it_can_sample():
+    """Also after a checkpoint was restored, which writes transitions and their number directly."""
+    replay = filled([4, 7], [3, 8], capacity=5)
+    replay.flush()
+    assert replay.sizes.tolist() == [[3], [5]]
+    replay.added[0] = 4
+    replay.flush()
+    assert replay.sizes.tolist() == [[4], [5]]

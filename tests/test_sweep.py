@@ -21,12 +21,13 @@ from store.folder import find_runs
 from store.interrupt import Interrupted, Interrupts
 from store.lock import LockedError, lock_owner, run_lock
 from sweep import estimates
-from sweep.cells import CellFolders, format_seeds
+from sweep.cells import Cell, CellFolders, format_seeds
 from sweep.plan import make_plan
 from sweep.progress import Display, End
 from sweep.settings import parse_sweep
 from sweep.states import Stage, job_states, state_of
 from sweep.status import find_cells
+from sweep.train import on_this_machine
 
 ROOT = Path(__file__).parents[1]
 SHORT = (
@@ -61,7 +62,8 @@ def outcomes(root):
 
 
 def plan_of(words, root, jobs=()):
-    return make_plan(cells_of([*words.split(), f"results={root}"]), dict(jobs))
+    cells = cells_of([*words.split(), f"results={root}"])
+    return make_plan([Cell.of(on_this_machine(cell.config, 1)) for cell in cells], dict(jobs))  # as the launcher does
 
 
 # ---------------------------------------------------------------- settings
@@ -101,9 +103,9 @@ def test_settings_of_a_sweep_are_no_settings_of_its_runs():
         ("launcher=slurm slurm.hours=nan", "bad value nan for slurm.hours"),
         ("launcher=slurm slurm.=1", "expected key=value"),
         ("launcher=slurm device=cuda", "device=cuda with launcher=slurm needs slurm.gpus= of at least 1"),
-        ("launcher=slurm slurm.gpus=2", "slurm.gpus=2 needs device=cuda"),
-        ("launcher=slurm slurm.gpus=1 device=gpu", "bad value 'gpu' for device: must be cpu, cuda or cuda:N"),
-        ("device=cuda:", "bad value 'cuda:' for device: must be cpu, cuda or cuda:N"),
+        ("launcher=slurm slurm.gpus=2 device=cpu", "slurm.gpus=2 needs device=cuda"),
+        ("launcher=slurm slurm.gpus=1 device=gpu", "bad value 'gpu' for device: must be auto, cpu, cuda or cuda:N"),
+        ("device=cuda:", "bad value 'cuda:' for device: must be auto, cpu, cuda or cuda:N"),
         ("launcher=slurm overwrite=true", "overwrite=true does not go with launcher=slurm"),
         ("jobs=2 slurm.cpus=2", "slurm.cpus= needs launcher=slurm"),
         ("jobs=2 seed=1-0", "is empty"),

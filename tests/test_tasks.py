@@ -4,6 +4,9 @@ import inspect
 import json
 import pickle
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -18,6 +21,7 @@ from envs.locomotion import HalfCheetah, Hopper, Walker2d
 from envs.reacher import Reacher
 from envs.registry import Task
 
+ROOT = Path(__file__).resolve().parent.parent
 ROW = {"robot": Reacher, "constraint": Ball(0.1, 2), "description": "a task", "formula": "x", "steps": 1000}
 
 
@@ -132,6 +136,13 @@ def test_gymnasium_finds_a_task_that_is_entered_later(table):
     assert np.isfinite(env.step(np.ones(2, np.float32))[1])
     vector = gymnasium.make_vec("acrl/P-O.3_x-é-v0", num_envs=2, project=True)
     assert vector.reset(seed=0)[0].shape == (2, 9)
+
+
+def test_the_modules_can_be_loaded_again():
+    code = "import importlib, envs, envs.registry\nfor module in (envs.registry, envs.tasks):\n"
+    code += "    importlib.reload(module)\nimport gymnasium; gymnasium.make('acrl/W-M-v0').reset(seed=0)"
+    run = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
 
 
 def test_a_registered_task_is_copied_as_itself():

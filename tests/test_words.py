@@ -20,6 +20,7 @@ def test_words_become_a_dict_in_their_order():
         (["a="], "expected key=value, got 'a='"),
         (["my.=1"], "expected key=value, got 'my.=1'"),
         (["colr=1"], "unknown key 'colr'; did you mean color? (choices: a, color)"),
+        (["zzz=1"], "unknown key 'zzz' (choices: a, color)"),
         (["a=1", "a=2"], "key 'a' given twice: '1' and '2'"),
     ],
 )
@@ -47,6 +48,15 @@ def test_a_name_that_resembles_no_other_gets_no_hint():
     with pytest.raises(ConfigError) as error:
         known_name("colour", 7, COLOURS)
     assert str(error.value) == "unknown colour '7' (choices: red, green, Blue)"
+
+
+def test_of_many_names_the_one_meant_is_enough():
+    names = [f"name{i}" for i in range(30)] + ["colour"]
+    with pytest.raises(ConfigError) as error:
+        known_name("key", "color", names)
+    assert str(error.value) == "unknown key 'color'; did you mean colour?"
+    with pytest.raises(ConfigError, match="choices: name0, name1, "):
+        known_name("key", "xyz", names)
 
 
 def test_whole_numbers():

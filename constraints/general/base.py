@@ -2,41 +2,133 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from typing import Any, Literal, TypeVar
+
 import torch
 from torch import Tensor
 
-from constraints.base import Constraint
-from constraints.errors import ConstraintError, name_samples, require
+from constraints.base import Constraint, ExplicitSet
+from constraints.checks import ON_BOUNDARY
+from constraints.ellipse import ellipse_gauge_gradient
+from constraints.errors import ConstraintError, EmptySetError, name_samples, require
 from constraints.general.active_set import project_on_rows
-from constraints.general.centers import deep_points, interior_points
+from constraints.general.centers import deep_points, guessed_points, interior_points, least_excess, widened
+from constraints.general.derivatives import projection_jacobian, with_derivatives
 from constraints.general.linear_programs import maximize_on_rows
-from constraints.general.projection import closest_points, optimal_points, projection_jacobian
+from constraints.general.projection import closest_points, optimal_points
 from constraints.general.scaled_sets import ScaledSets, scale_sets
 from constraints.jacobian import JacobianProduct
 from constraints.numerics import is_traced, times
 
-# A centre given for a gauge that is nearer than this to the boundary is on it, up to rounding.
-ON_BOUNDARY = 1e-12
+OnEmpty = Literal["error", "least"]
+Result = TypeVar("Result")
+
+
+class At:
+    """A set at observations (..., n): the tensors of its coefficients, and the set written out when that is needed."""
+
+    def __init__(
+        self, obs: Tensor, tensors: list[Tensor], write: Callable[[], ExplicitSet], parts: tuple[Any, ...] = ()
+    ):
+        self.obs, self.parts = obs, parts
+        self._tensors, self._write = tensors, write
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return iter(self._tensors)
+
+    @property
+    def lead(self) -> tuple[int, ...]:
+        """The leading shape of the observations."""
+        return tuple(self.obs.shape[:-1])
+
+    @cached_property
+    def written(self) -> ExplicitSet:
+        """The set's rows and ellipses."""
+        return self._write()
 
 
 class GeneralConstraint(Constraint):
-    """A set that `explicit(obs)` writes out. A subclass adds that, `_violation` and `_gauge_gradients`."""
+    """A set that `explicit(obs)` writes out. A subclass adds that, `_coefficients`, `_violation` and `_part_gauges`.
+
+    `on_empty` says what happens where no action meets the constraint: "error" raises an EmptySetError with the sample;
+    with "least", the set is that of the actions in the box with the least violation, up to 5e-7, and `violation`
+    reports it. ValueError for another value.
+    """
 
     origin_centered = False
     solved_on_cpu = True
 
-    def _gauge_and_gradient(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
+    def __init__(self, dim: int, on_empty: OnEmpty = "error"):
+        super().__init__(dim)
+        if on_empty not in ("error", "least"):
+            raise ValueError(f"on_empty is {on_empty!r} (choices: 'error' 'least')")
+        self.on_empty = on_empty
+
+    @torch.no_grad()
+    def least_violation(self, obs: Tensor) -> Tensor:
+        at = self._coefficients(obs.double())
+        sets = scale_sets(at.written, at.lead, check=False)
+        # A row 0 <= b is violated by -b wherever one is.
+        fixed = torch.where(sets.solid, 0.0, -sets.bounds).amax(-1)
+        return torch.maximum(least_excess(sets), fixed).clamp(min=0.0).view(at.lead).to(obs)
+
+    def _coefficients(self, obs: Tensor) -> At:
+        """The coefficients at obs (..., n), checked."""
+        raise NotImplementedError
+
+    def _part_gauges(self, at: At, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        """`_gauge_gradients`; a ConstraintError where the centre is not interior."""
+        raise NotImplementedError
+
+    def _at(self, obs: Tensor) -> At | Tensor:
+        # Transforms of torch.func see the solvers from outside, as one function of the observation.
+        return obs if torch._C._are_functorch_transforms_active() else self._coefficients(obs)
+
+    def at(self, at: At | Tensor) -> At:
+        """The coefficients, whatever `_at` returned."""
+        return self._coefficients(at) if isinstance(at, Tensor) else at
+
+    def _check_center(self, at: At | Tensor, center: Tensor) -> None:
+        pass  # in every call where it is used, below and in the subclasses
+
+    def _gauge_and_gradient(self, at: At | Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         if center is not None:
             inside = center.abs().amax(-1) < 1.0 - ON_BOUNDARY
             require(inside.flatten(), "the centre is not inside the box", name_samples(tuple(inside.shape)))
             center = center.expand_as(direction)
-        return super()._gauge_and_gradient(obs, direction, center)
+        return super()._gauge_and_gradient(at, direction, center)
 
-    def _project(self, obs: Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
-        sets = self._scaled_sets(obs, action.shape[:-1])
-        target = action.reshape(-1, self.dim).cpu()
-        finite = target.isfinite().all(-1, keepdim=True)
-        solution, metric, multipliers = closest_points(sets, torch.where(finite, target, 0.0))
+    def _gauge_gradients(self, at: At | Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        at = self.at(at)
+        try:
+            return self._part_gauges(at, direction, center)
+        except ConstraintError:
+            if self.on_empty != "least":
+                raise
+        # No centre is inside a set that is empty; it may be inside what stands for the set.
+        self._refuse_derivatives(at, "where the set is empty")
+        lead = tuple(direction.shape[:-1])
+        sets = widened(scale_sets(at.written, lead, check=False), flat=True)
+        middle = torch.zeros_like(direction) if center is None else center
+        require(sets.depth(middle.reshape(-1, self.dim).cpu()) > 0.0, "the centre is not interior", sets.name)
+        along, offset = direction.reshape(-1, 1, self.dim).cpu(), middle.reshape(-1, 1, self.dim).cpu()
+        slack = sets.bounds - times(sets.rows, offset.squeeze(1))
+        first = (times(sets.rows, along.detach().squeeze(1)) / slack).argmax(-1, keepdim=True)
+        row = sets.rows.take_along_dim(first.unsqueeze(-1), 1).squeeze(1) / slack.gather(-1, first)
+        offset = offset - sets.center
+        bent, bent_along = times(sets.matrix, offset), times(sets.matrix, along)
+        ellipses = ellipse_gauge_gradient(along, bent_along, offset, bent, 1.0)
+        return [part.view(direction.shape).to(direction.device) for part in (row, *ellipses.unbind(1))]
+
+    def _project(self, at: At | Tensor, action: Tensor) -> tuple[Tensor, JacobianProduct]:
+        at = self.at(at)
+        self._refuse_derivatives(at, "here")
+        target, finite = self._finite(action)
+        sets, (solution, metric, multipliers) = self._solve(
+            at, action.shape[:-1], lambda sets: closest_points(sets, target)
+        )
 
         def product(vector: Tensor) -> Tensor:
             jacobian = projection_jacobian(sets, solution, metric, multipliers)
@@ -46,63 +138,84 @@ class GeneralConstraint(Constraint):
         answer = torch.where(finite, solution, torch.nan)
         return answer.view(action.shape).to(action.device), product
 
-    def _linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
-        sets = self._scaled_sets(obs, gradient.shape[:-1])
-        slope = gradient.reshape(-1, self.dim).cpu()
+    def _differentiable_projection(self, at: At | Tensor, action: Tensor) -> Tensor:
+        if isinstance(at, Tensor):
+            return super()._differentiable_projection(at, action)
+        target, finite = self._finite(action)
+
+        def solve(sets: ScaledSets) -> Tensor:
+            with torch.no_grad():
+                solution = closest_points(sets.detach(), target.detach())
+            return with_derivatives(sets, target, *solution)
+
+        solution = self._solve(at, action.shape[:-1], solve)[1]
+        return torch.where(finite, solution, torch.nan).view(action.shape).to(action.device)
+
+    def _linear_oracle(self, at: At | Tensor, gradient: Tensor) -> Tensor:
+        at = self.at(at)
+        self._refuse_derivatives(at, "here")
+        slope, finite = self._finite(gradient)
         size = slope.abs().amax(-1, keepdim=True)
-        finite = size.isfinite()
-        slope = torch.where(finite & (size > 0.0), slope / size, 0.0)
-        if sets.curved:
-            solution = optimal_points(sets, slope, linear=True)[0]
-        else:
-            corner = sets.given_rows + torch.arange(self.dim) + self.dim * (slope < 0.0)
-            solution, _ = maximize_on_rows(sets.rows, sets.bounds, slope, corner, sets.name, sets.given_rows)
-            # The solution may leave the set by the linear program's rounding.
-            solution = project_on_rows(sets.rows, sets.bounds, solution, sets.name, sets.given_rows)[0]
+        slope = torch.where(size > 0.0, slope / size, 0.0)
+
+        def solve(sets: ScaledSets) -> Tensor:
+            if sets.curved:
+                return optimal_points(sets, slope, linear=True)[0]
+            corner = sets.given_rows + torch.arange(self.dim, device=slope.device) + self.dim * (slope < 0.0)
+            point, _ = maximize_on_rows(sets.rows, sets.bounds, slope, corner, sets.name, sets.given_rows)
+            # It may leave the set by the linear program's rounding.
+            return project_on_rows(sets.rows, sets.bounds, point, sets.name, sets.given_rows)[0]
+
+        solution = self._solve(at, gradient.shape[:-1], solve)[1]
         return torch.where(finite, solution, torch.nan).view(gradient.shape).to(gradient.device)
 
-    def _center(self, obs: Tensor) -> Tensor:
-        sets = self._scaled_sets(obs, obs.shape[:-1])
-        center = interior_points(sets) if sets.curved else deep_points(sets)
-        return center.view(*obs.shape[:-1], self.dim).to(obs.device)
+    def _center(self, at: At | Tensor) -> Tensor:
+        at = self.at(at)
 
-    def _scaled_sets(self, obs: Tensor, lead: tuple[int, ...]) -> ScaledSets:
-        written = self.explicit(obs)
-        ellipses = [value for ellipse in written.ellipses for value in ellipse]
-        if is_traced(written.rows, written.bounds, *ellipses):
+        def solve(sets: ScaledSets) -> Tensor:
+            if not sets.curved:
+                return deep_points(sets)
+            center, guess = interior_points(sets.detach()), guessed_points(sets)
+            if not torch.equal(center, guess):
+                self._refuse_derivatives(at, "where the centre of its ellipse, or the origin, is not deep inside")
+                return center
+            return guess
+
+        return self._solve(at, at.lead, solve, interior=True)[1].view(*at.lead, self.dim).to(at.obs.device)
+
+    def _solve(
+        self, at: At, lead: tuple[int, ...], solve: Callable[[ScaledSets], Result], interior: bool = False
+    ) -> tuple[ScaledSets, Result]:
+        """The sets of a batch of shape `lead`, and what `solve` makes of them or of what stands for empty ones.
+
+        `interior`: whether it needs an interior on rows; with ellipses it always may.
+        """
+        try:
+            sets = scale_sets(at.written, lead)
+            return sets, solve(sets)
+        except EmptySetError:
+            if self.on_empty != "least":
+                raise
+        self._refuse_derivatives(at, "where the set is empty")
+        sets = scale_sets(at.written, lead, check=False)
+        sets = widened(sets, flat=interior or sets.curved)
+        return sets, solve(sets)
+
+    def _finite(self, vector: Tensor) -> tuple[Tensor, Tensor]:
+        """Vectors (..., d) as a batch (n, d) on the CPU, 0 where they are NaN or infinite, and where (n, 1) not."""
+        flat = vector.reshape(-1, self.dim).cpu()
+        finite = flat.isfinite().all(-1, keepdim=True)
+        return torch.where(finite, flat, 0.0), finite
+
+    def _refuse_derivatives(self, at: At, where: str) -> None:
+        if is_traced(*at):
             raise RuntimeError(
-                f"project, center and linear_oracle of {type(self).__name__} have no gradient with respect to the"
-                " observation or to learned coefficients, and no torch.func transforms; pass obs.detach(), or"
-                " coefficients without gradients"
+                f"{type(self).__name__} has no gradient with respect to the observation or to learned coefficients "
+                f"{where}; pass obs.detach(), or coefficients without gradients"
             )
-        return scale_sets(written, lead)
 
 
 def check_obs(obs: Tensor) -> None:
     """Raise a ConstraintError for a NaN or infinite observation."""
     valid = obs.isfinite().all(-1)
     require(valid.flatten(), "the observation is NaN or infinite", name_samples(tuple(valid.shape)))
-
-
-def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tensor) -> Tensor:
-    """Coefficients as float64 (*lead, *shape), finite and of the expected shape, or a ConstraintError.
-
-    -1 in `shape` stands for any size; lead may be the observation's leading shape or one that broadcasts to it.
-    """
-    values = torch.as_tensor(values, dtype=torch.float64, device=obs.device)
-    lead = values.shape[: values.dim() - len(shape)]
-    fits = len(values.shape) >= len(shape) and all(
-        have == want or want == -1 for have, want in zip(values.shape[len(lead) :], shape, strict=True)
-    )
-    try:
-        fits = fits and torch.broadcast_shapes(lead, obs.shape[:-1]) == obs.shape[:-1]
-    except RuntimeError:
-        fits = False
-    if not fits:
-        wanted = ", ".join(["..."] + ["m" if size == -1 else str(size) for size in shape])
-        raise ConstraintError(
-            f"{what} has shape {tuple(values.shape)}, expected ({wanted}) with ... = {tuple(obs.shape[:-1])}"
-        )
-    valid = values.isfinite().flatten(len(lead)).all(-1) if shape else values.isfinite()
-    require(valid.flatten(), f"{what} is NaN or infinite", name_samples(tuple(lead)))
-    return values

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from constraints.errors import EmptySetError, require
 from constraints.general.active_set import project_on_rows
+from constraints.general.derivatives import with_derivatives
 from constraints.general.interior_point import solve_cone_programs
 from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.scaled_sets import NO_INTERIOR, ScaledSets
@@ -14,42 +17,68 @@ from constraints.numerics import times
 
 # The share of the largest radius that a centre keeps. A larger one leaves less room in which it moves continuously.
 _DEEP = 0.9
-_TRACE = 1e-11
 # A guess less deep than this, or than half of the largest depth, gives way to the deepest point.
 _SHALLOW = 1e-2
+# The depth of the interior that `widened` gives to sets without one; single precision can tell it from 0.
+_ROOM = 5e-7
+# The rounding of the least violation, where that is large.
+_SHARE = 1e-12
 # The interior-point method's accuracy: deep enough below NO_INTERIOR to tell a thin set from a flat one.
 _ACCURACY = 1e-12
 
 
-def deep_points(sets: ScaledSets) -> Tensor:
+def deep_points(traced: ScaledSets) -> Tensor:
     """Centres (n, d) of sets without ellipses: the point nearest to the origin of those that are `_DEEP` times as deep
-    as the deepest. A ConstraintError where a set is empty or flat.
+    as the deepest. An EmptySetError where a set is empty or flat. Differentiable where the sets are.
 
     It is continuous in rows and bounds. The largest depth is: it is the maximum over the box of a continuous function.
     The points of that share of it are a convex set with interior, so they move continuously, and so does the one of
     them that is nearest to the origin. The deepest points themselves may jump: those of a wedge are at its wide end,
     however small its angle.
     """
-    radius = largest_radius(sets)
-    require(radius >= -NO_INTERIOR, "the set is empty", sets.name, EmptySetError)
-    require(radius > NO_INTERIOR, "the set has no interior", sets.name)
-    bounds = sets.bounds - _DEEP * radius.unsqueeze(-1) * sets.solid
-    return project_on_rows(sets.rows, bounds, torch.zeros_like(sets.rows[:, 0]), sets.name, sets.given_rows)[0]
+    sets = traced.detach()
+    deepest, weight = deepest_on_rows(sets)
+    require(deepest[:, -1] >= -NO_INTERIOR, "the set is empty", sets.name, EmptySetError)
+    require(deepest[:, -1] > NO_INTERIOR, "the set has no interior", sets.name, EmptySetError)
+    radius = deepest[:, -1]
+    if traced.rows.requires_grad or traced.bounds.requires_grad:
+        # The radius changes with the slacks at the deepest point, by the multipliers of its rows.
+        slack = traced.bounds - times(traced.rows, deepest[:, :-1])
+        radius = radius + (weight * (slack - slack.detach())).sum(-1)
+    shrunk = replace(traced, bounds=traced.bounds - _DEEP * radius.unsqueeze(-1) * sets.solid)
+    target = torch.zeros_like(sets.rows[:, 0])
+    bounds = shrunk.bounds.detach()
+    center, multipliers = project_on_rows(sets.rows, bounds, target, sets.name, sets.given_rows)
+    if not shrunk.bounds.requires_grad:
+        return center
+    flat = torch.eye(sets.dim, dtype=target.dtype, device=target.device).expand(len(target), -1, -1)
+    return with_derivatives(shrunk, target, center, flat, multipliers)
 
 
-def largest_radius(sets: ScaledSets) -> Tensor:
-    """Radius (n,) of the largest ball in each set, the ellipses left out; negative where it is empty."""
+def deepest_on_rows(sets: ScaledSets, box: bool = True) -> tuple[Tensor, Tensor]:
+    """The deepest point of each set and its depth, as the last coordinate (n, d + 1), and multipliers (n, m).
+
+    Ellipses are left out. The depth is the distance to the nearest row that is not 0, negative where there is no point
+    in all of them; without `box`, the box's rows do not bound the depth, but the point. The multipliers say how the
+    depth changes with the bounds.
+    """
     m, d = sets.given_rows, sets.dim
-    # The last coordinate is the radius; rows have unit norm again. Zero rows do not bound it.
-    shrink = torch.where(sets.solid, 0.5, 1.0).to(sets.rows).sqrt()
-    rows = torch.cat((sets.rows, sets.solid.to(sets.rows).unsqueeze(-1)), -1) * shrink.unsqueeze(-1)
-    # To begin with, two opposite faces of the box hold the radius. The others get a trace of it, so that the simplex
-    # method does not exchange rows without effect.
-    slope = torch.full_like(rows[:, 0], _TRACE)
-    slope[:, 0], slope[:, -1] = 0.0, 1.0
-    basis = m + torch.cat((torch.arange(d, device=rows.device), torch.tensor([d], device=rows.device)))
-    basis = basis.expand(len(rows), -1)
-    return maximize_on_rows(rows, sets.bounds * shrink, slope, basis, sets.name, sets.given_rows)[0][:, -1]
+    solid = sets.solid
+    if not box:
+        solid = solid & sets.given
+    # Rows of unit norm again.
+    shrink = torch.where(solid, 0.5, 1.0).to(sets.rows).sqrt()
+    rows = torch.cat((sets.rows, solid.to(sets.rows).unsqueeze(-1)), -1) * shrink.unsqueeze(-1)
+    slope = torch.zeros_like(rows[:, 0])
+    slope[:, -1] = 1.0
+    # To begin with, the depth is held by one row, the tightest, and the faces of the box opposite to it.
+    reach = sets.rows.abs().sum(-1)
+    limit = torch.where(solid, (sets.bounds + reach) / (1.0 + reach), torch.inf)
+    first = limit[:, : m + 1].argmin(-1, keepdim=True)
+    towards = sets.rows.take_along_dim(first.unsqueeze(-1), 1).squeeze(1) >= 0.0
+    basis = torch.cat((first, m + torch.arange(d, device=first.device) + d * towards), -1)
+    solution, weight = maximize_on_rows(rows, sets.bounds * shrink, slope, basis, sets.name, m)
+    return solution, weight * shrink * solid
 
 
 def interior_points(sets: ScaledSets) -> Tensor:
@@ -77,7 +106,21 @@ def guessed_points(sets: ScaledSets) -> Tensor:
 
 
 def deepest_points(sets: ScaledSets) -> Tensor:
-    """Points (n, d) of the largest `depth`, of sets with ellipses; a ConstraintError where that is not positive."""
+    """Points (n, d) of the largest `depth`, of sets with ellipses; an EmptySetError where that is not positive."""
+    solution, converged = _deepest_in_cones(sets, box=True)
+    point = solution[:, :-1]
+    deep = sets.depth(point) > NO_INTERIOR
+    require(deep | converged, "the interior-point method failed", sets.name)
+    require(deep | (solution[:, -1] >= -NO_INTERIOR), "the set is empty", sets.name, EmptySetError)
+    require(deep, "the set has no interior", sets.name, EmptySetError)
+    return point
+
+
+def _deepest_in_cones(sets: ScaledSets, box: bool) -> tuple[Tensor, Tensor]:
+    """The deepest point of sets with ellipses and its depth (n, d + 1), and whether (n,) the method converged.
+
+    Without `box`, the box's rows do not bound the depth, but the point.
+    """
     # Around the centre of the smallest ellipse, in its size.
     traces = sets.matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
     size = sets.inverse_size()
@@ -88,7 +131,8 @@ def deepest_points(sets: ScaledSets) -> Tensor:
     sink = torch.zeros_like(offset)
     sink[..., 0] = 1.0 / (size * sets.root)
     matrix = torch.cat((matrix, sink.unsqueeze(-1)), -1)
-    rows = torch.cat((sets.rows, sets.solid.to(sets.rows).unsqueeze(-1)), -1)
+    solid = sets.solid if box else sets.solid & sets.given
+    rows = torch.cat((sets.rows, solid.to(sets.rows).unsqueeze(-1)), -1)
     bounds = size * (sets.bounds - times(sets.rows, origin))
     gradient = torch.zeros_like(rows[:, 0])
     gradient[:, -1] = 1.0
@@ -96,9 +140,35 @@ def deepest_points(sets: ScaledSets) -> Tensor:
     flat = torch.zeros_like(size)
     solution, _, converged = solve_cone_programs(flat, gradient, rows, bounds, matrix, offset, start, _ACCURACY)
     solution = solution / size
-    point = origin + solution[:, :-1]
-    deep = sets.depth(point) > NO_INTERIOR
-    require(deep | converged, "the interior-point method failed", sets.name)
-    require(deep | (solution[:, -1] >= -NO_INTERIOR), "the set is empty", sets.name, EmptySetError)
-    require(deep, "the set has no interior", sets.name)
-    return point
+    return torch.cat((origin + solution[:, :-1], solution[:, -1:]), -1), converged
+
+
+def least_excess(sets: ScaledSets) -> Tensor:
+    """The least (n,) by which points of the box leave rows and ellipses, negative where they are inside.
+
+    A row 0 <= b does not count. Where there is nothing else, it is -1.
+    """
+    sets = replace(sets, bounds=torch.where(sets.solid, sets.bounds, 1.0))
+    bounded = (sets.solid & sets.given).any(-1) | (sets.matrix.shape[1] > 0)
+    excess = torch.full_like(sets.bounds[:, 0], -1.0)
+    index = bounded.nonzero().squeeze(-1)
+    if len(index) > 0:
+        part = sets[index]
+        deepest = (_deepest_in_cones(part, False) if sets.curved else deepest_on_rows(part, False))[0]
+        excess[index] = -deepest[:, -1]
+    return excess
+
+
+def widened(sets: ScaledSets, flat: bool) -> ScaledSets:
+    """The sets with rows and ellipses, not the box, moved outwards by the same distance where they are empty.
+
+    With `flat`, also where they have no interior. The distance is the least with which a set has an interior of the
+    depth `_ROOM`: its points violate the constraint by no more than the least possible violation and `_ROOM`. A row
+    0 <= b < 0 is left out, as no action meets it.
+    """
+    excess = least_excess(sets)
+    growth = torch.where(excess > (-_ROOM if flat else NO_INTERIOR), excess * (1.0 + _SHARE) + _ROOM, 0.0)
+    growth = growth.unsqueeze(-1)
+    bounds = torch.where(sets.solid, sets.bounds, 1.0) + growth * sets.given
+    factor = (1.0 + growth / sets.root).square()
+    return replace(sets, bounds=bounds, matrix=sets.matrix / factor[..., None, None], root=sets.root + growth)

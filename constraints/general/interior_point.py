@@ -40,7 +40,7 @@ def solve_cone_programs(
     count = len(rows)
     stacked = torch.cat((rows, matrix.flatten(1, 2)), 1)
     limits = torch.cat((bounds, offset.flatten(1)), 1)
-    root = curvature.sqrt().unsqueeze(-1) * torch.eye(dim, dtype=rows.dtype)
+    root = curvature.sqrt().unsqueeze(-1) * torch.eye(dim, dtype=rows.dtype, device=rows.device)
     unit = torch.zeros_like(limits[:1])
     unit[:, :m] = 1.0
     unit[:, m::q] = 1.0
@@ -58,8 +58,8 @@ def solve_cone_programs(
     mirrored = torch.cat((cone[..., :1], -cone[..., 1:]), -1) / _cone_size(cone).square()
     dual = slack.amax(-1, keepdim=True) * torch.cat((1.0 / slack[:, :m], mirrored.flatten(1)), 1)
     best, best_dual = point.clone(), dual.clone()
-    least, improved = torch.full((count,), torch.inf, dtype=rows.dtype), torch.zeros(count, dtype=torch.long)
-    sample = torch.arange(count)  # unfinished ones
+    least, improved = rows.new_full((count,), torch.inf), rows.new_zeros(count, dtype=torch.long)
+    sample = torch.arange(count, device=rows.device)  # unfinished ones
     for number in range(_MAX_STEPS):
         stationary = curvature * point - gradient + times(stacked.mT, dual)
         infeasible = slack + times(stacked, point) - limits

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from constraints.base import Constraint, ExplicitSet
+from constraints.checks import ON_BOUNDARY
 from constraints.errors import name_samples, require
-from constraints.general.base import ON_BOUNDARY, GeneralConstraint, check_obs
+from constraints.general.base import At, GeneralConstraint, OnEmpty, check_obs
+from constraints.implicit import tensors_of
 
 
 class Intersection(GeneralConstraint):
@@ -20,42 +25,56 @@ class Intersection(GeneralConstraint):
     as those of LinearConstraint and QuadraticConstraint do.
     """
 
-    def __init__(self, *constraints: Constraint):
+    def __init__(self, *constraints: Constraint, on_empty: OnEmpty = "error"):
+        wrong = next((part for part in constraints if not isinstance(part, Constraint)), None)
+        if wrong is not None:
+            hint = "; pass them one by one: Intersection(a, b)" if isinstance(wrong, list | tuple) else ""
+            raise TypeError(f"an intersection is of constraints, got {type(wrong).__name__}{hint}")
         if not constraints:
             raise ValueError("an intersection needs at least one constraint")
         dims = {constraint.dim for constraint in constraints}
         if len(dims) > 1:
             raise ValueError(f"constraints of different dimensions: {sorted(dims)}")
-        super().__init__(dims.pop())
+        super().__init__(dims.pop(), on_empty)
         self.constraints = constraints
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
+        return self._coefficients(obs).written
+
+    def _coefficients(self, obs: Tensor) -> At:
         check_obs(obs)
-        parts = [constraint.explicit(obs) for constraint in self.constraints]
+        parts = tuple(constraint._at(obs) for constraint in self.constraints)
+        tensors = [tensor for part in parts for tensor in tensors_of(part)]
+        return At(obs, tensors, lambda: self._write(obs, parts), parts)
+
+    def _write(self, obs: Tensor, at: tuple[Any, ...]) -> ExplicitSet:
+        parts = [
+            part.written if isinstance(part, At) else constraint.explicit(obs)
+            for constraint, part in zip(self.constraints, at, strict=True)
+        ]
         leads = [lead for part in parts for lead in (part.rows.shape[:-2], part.bounds.shape[:-1])]
         lead = torch.broadcast_shapes(*leads)
         rows = torch.cat([part.rows.expand(*lead, *part.rows.shape[-2:]) for part in parts], -2)
         bounds = torch.cat([part.bounds.expand(*lead, part.bounds.shape[-1]) for part in parts], -1)
         return ExplicitSet(rows, bounds, [ellipse for part in parts for ellipse in part.ellipses])
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        check_obs(obs)
-        excess = [constraint._violation(constraint._at(obs), action) for constraint in self.constraints]
+    def _violation(self, at: At | Tensor, action: Tensor) -> Tensor:
+        excess = [part._violation(own, action) for part, own in self._parts(at)]
         return torch.stack(torch.broadcast_tensors(*excess)).amax(0)
 
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        check_obs(obs)
-        return sum(
-            (constraint._penalty(constraint._at(obs), action) for constraint in self.constraints), 0.0 * action.sum(-1)
-        )
+    def _penalty(self, at: At | Tensor, action: Tensor) -> Tensor:
+        return sum((part._penalty(own, action) for part, own in self._parts(at)), 0.0 * action.sum(-1))
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        check_obs(obs)
+    def _part_gauges(self, at: At, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         gradients = []
-        for constraint in self.constraints:
+        for part, own in self._parts(at):
             # The closed forms do not check the centre.
-            if not isinstance(constraint, GeneralConstraint) and center is not None:
-                inside = constraint._violation(constraint._at(obs), center) < -ON_BOUNDARY
+            if not isinstance(part, GeneralConstraint) and center is not None:
+                inside = part._violation(own, center) < -ON_BOUNDARY
                 require(inside.flatten(), "the centre is not interior", name_samples(tuple(inside.shape)))
-            gradients.append(constraint._gauge_and_gradient(constraint._at(obs), direction, center)[1])
+            gradients.append(part._gauge_and_gradient(own, direction, center)[1])
         return gradients
+
+    def _parts(self, at: At | Tensor) -> Iterator[tuple[Constraint, Any]]:
+        """Each constraint with its coefficients."""
+        return zip(self.constraints, self.at(at).parts, strict=True)

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from constraints.base import ExplicitSet
+from constraints.checks import ON_BOUNDARY, checked
 from constraints.errors import name_samples, require
-from constraints.general.base import ON_BOUNDARY, GeneralConstraint, check_obs, checked
+from constraints.general.base import At, GeneralConstraint, OnEmpty, check_obs
 from constraints.general.scaled_sets import unit_rows
 from constraints.numerics import safe_sqrt, times
 
@@ -29,8 +30,9 @@ class LinearConstraint(GeneralConstraint):
         dim: int,
         A: Callable[[Tensor], Tensor] | None = None,
         b: Callable[[Tensor], Tensor] | None = None,
+        on_empty: OnEmpty = "error",
     ):
-        super().__init__(dim)
+        super().__init__(dim, on_empty)
         self._A, self._b = A, b
 
     def A(self, obs: Tensor) -> Tensor:
@@ -51,22 +53,26 @@ class LinearConstraint(GeneralConstraint):
         bounds = checked(self.b(obs), "b(obs)", (rows.shape[-2],), obs)
         return ExplicitSet(rows, bounds, [])
 
-    def _excess(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Ax - b (..., m) with unit rows."""
+    def _coefficients(self, obs: Tensor) -> At:
         written = self.explicit(obs)
+        return At(obs, [written.rows, written.bounds], lambda: written)
+
+    def _excess(self, at: At | Tensor, action: Tensor) -> Tensor:
+        """Ax - b (..., m) with unit rows."""
+        written = self.at(at).written
         rows, bounds = unit_rows(written.rows, written.bounds)
         return times(rows, action) - bounds
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        excess = self._excess(obs, action)
-        return torch.cat((excess, action.detach().abs().amax(-1, keepdim=True) - 1.0), -1).amax(-1)
+    def _violation(self, at: At | Tensor, action: Tensor) -> Tensor:
+        excess = self._excess(at, action)
+        # There may be no rows.
+        return torch.cat((excess, torch.full_like(action[..., :1], -torch.inf)), -1).amax(-1)
 
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        return safe_sqrt(self._excess(obs, action).clamp(min=0.0).square().sum(-1))
+    def _penalty(self, at: At | Tensor, action: Tensor) -> Tensor:
+        return safe_sqrt(self._excess(at, action).clamp(min=0.0).square().sum(-1))
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        written = self.explicit(obs)
-        rows, bounds = unit_rows(written.rows, written.bounds)
+    def _part_gauges(self, at: At, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        rows, bounds = unit_rows(at.written.rows, at.written.bounds)
         lead, m = direction.shape[:-1], rows.shape[-2]
         rows, slack = rows.expand(*lead, m, self.dim), bounds.expand(*lead, m)
         if m == 0:

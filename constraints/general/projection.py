@@ -1,4 +1,4 @@
-"""Projection on sets of rows and ellipses and its Jacobian, and the linear oracle of sets with ellipses.
+"""Projection on sets of rows and ellipses, and the linear oracle of sets with ellipses.
 
 - On rows alone: a dual active-set method, exact to rounding. It is faster than a loop over OSQP, and stays exact for
   points far away, where OSQP stops converging.
@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,18 +37,12 @@ _LAST_PROGRAM_STEP = 1e-9
 # the step's length, so three are exact to rounding.
 _PROXIMAL_STEP = 1e3
 _PROXIMAL_STEPS = 3
-# Constraints with less slack than this are active in the Jacobian.
-_ACTIVE = 1e-9
-# A unit normal depends on others where its part outside their span is shorter than this.
-_IN_SPAN = 1e-6
-# Singular values of unit normals below this are 0 up to rounding, and so are residuals of sums of them.
-_RANK = 1e-7
 
 
 def closest_points(sets: ScaledSets, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Closest points (n, d) to target (n, d), the Lagrangian's Hessian there (n, d, d), and multipliers (n, m + k)."""
     if not sets.curved:
-        metric = torch.eye(sets.dim, dtype=target.dtype).expand(len(target), sets.dim, sets.dim)
+        metric = torch.eye(sets.dim, dtype=target.dtype, device=target.device).expand(len(target), sets.dim, sets.dim)
         solution, multipliers = project_on_rows(sets.rows, sets.bounds, target, sets.name, sets.given_rows)
         return solution, metric, multipliers
     outside = (sets.depth(target) < 0.0).nonzero().squeeze(-1)
@@ -189,7 +182,7 @@ def _sequential_programs(sets: ScaledSets, target: Tensor, point: Tensor, multip
 def _hessian(sets: ScaledSets, multipliers: Tensor) -> Tensor:
     """Hessian (n, d, d) of the projection's Lagrangian for the multipliers (n, m + k)."""
     curvature = multipliers[:, sets.rows.shape[1] :, None, None] * sets.matrix
-    return torch.eye(sets.dim, dtype=multipliers.dtype) + 2.0 * curvature.sum(1)
+    return torch.eye(sets.dim, dtype=multipliers.dtype, device=multipliers.device) + 2.0 * curvature.sum(1)
 
 
 def _pull_towards(sets: ScaledSets, inside: Tensor, point: Tensor) -> Tensor:
@@ -202,56 +195,3 @@ def _pull_towards(sets: ScaledSets, inside: Tensor, point: Tensor) -> Tensor:
     share = torch.where(excess > 0.0, excess / (excess + room), 0.0).amax(-1)
     share = torch.where(sets.depth(point) < -_OUTSIDE, share, 0.0)
     return torch.lerp(point, inside, share.unsqueeze(-1))
-
-
-# -------------------------------------------------------------------- Jacobian
-
-
-def projection_jacobian(sets: ScaledSets, solution: Tensor, hessian: Tensor, multipliers: Tensor) -> Tensor:
-    """Jacobian (n, d, d) of the projection: the Hessian's inverse on the subspace that the active constraints leave.
-
-    An active constraint without multiplier is a kink and does not count. The exception: where such constraints block
-    each other within the subspace that the others leave, as at the apex of a pyramid, they all count.
-    """
-    value, gradient = sets.ellipse_values(solution)
-    length = one_where_zero(gradient.norm(dim=-1))
-    normals = torch.cat((sets.rows, gradient / length.unsqueeze(-1)), 1)
-    slack = torch.cat((sets.bounds - times(sets.rows, solution), (1.0 - value) / length), 1)
-    holding = multipliers > 0.0
-    free = _null_projector(normals, holding)
-    other = (slack <= _ACTIVE) & ~holding
-    residual = (normals @ free) * other.unsqueeze(-1)
-    residual = torch.where(residual.norm(dim=-1, keepdim=True) > _IN_SPAN, residual, 0.0)
-    degenerate = ((residual != 0.0).any(-1).sum(-1) > 1).nonzero().squeeze(-1)
-    if len(degenerate) > 0:
-        for i in degenerate.tolist():
-            holding[i] |= _blocked(residual[i])
-        free[degenerate] = _null_projector(normals[degenerate], holding[degenerate])
-    identity = torch.eye(sets.dim, dtype=solution.dtype)
-    return free @ torch.linalg.solve(free @ hessian @ free + identity - free, free)
-
-
-def _null_projector(normals: Tensor, holding: Tensor) -> Tensor:
-    """Projector (n, d, d) on the space orthogonal to the rows of normals (n, m, d) where holding (n, m)."""
-    count = int(holding.sum(-1).max()) if holding.numel() > 0 else 0
-    first = holding.long().argsort(dim=-1, descending=True, stable=True)[:, :count]
-    held = normals.take_along_dim(first.unsqueeze(-1), 1) * holding.gather(-1, first).unsqueeze(-1)
-    _, size, axes = torch.linalg.svd(held, full_matrices=False)
-    axes = axes * (size > _RANK).unsqueeze(-1)
-    return torch.eye(normals.shape[-1], dtype=normals.dtype) - axes.mT @ axes
-
-
-def _blocked(normals: Tensor) -> Tensor:
-    """Which (m,) of the normals (m, d) are orthogonal to every v with normals @ v <= 0.
-
-    Those are the normals whose negative is a sum of the others with weights >= 0.
-    """
-    from scipy.optimize import nnls
-
-    blocked = torch.zeros(len(normals), dtype=torch.bool)
-    present = (normals != 0.0).any(-1).nonzero().squeeze(-1)
-    cone = normals[present].T.numpy()
-    for i in present.tolist():
-        wanted = -normals[i].numpy()
-        blocked[i] = bool(nnls(cone, wanted)[1] <= _RANK * np.linalg.norm(wanted))
-    return blocked

@@ -8,13 +8,11 @@ import torch
 from torch import Tensor
 
 from constraints.base import Ellipse, ExplicitSet
+from constraints.checks import ON_BOUNDARY, check_semidefinite, checked
 from constraints.ellipse import ellipse_excess, ellipse_gauge_gradient
 from constraints.errors import name_samples, require
-from constraints.general.base import ON_BOUNDARY, GeneralConstraint, check_obs, checked
+from constraints.general.base import At, GeneralConstraint, OnEmpty, check_obs
 from constraints.numerics import times
-
-# Asymmetry and negative eigenvalues of Q up to this share of its largest entry are rounding, in float32 too.
-_ROUNDING = 1e-6
 
 Coefficient = Callable[[Tensor], Tensor]
 
@@ -36,8 +34,9 @@ class QuadraticConstraint(GeneralConstraint):
         Q: Coefficient | None = None,
         bound: Coefficient | float | None = None,
         c: Coefficient | None = None,
+        on_empty: OnEmpty = "error",
     ):
-        super().__init__(dim)
+        super().__init__(dim, on_empty)
         self._Q, self._bound, self._c = Q, bound, c
 
     def Q(self, obs: Tensor) -> Tensor:
@@ -57,7 +56,12 @@ class QuadraticConstraint(GeneralConstraint):
         return obs.new_zeros(self.dim) if self._c is None else self._c(obs)
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
-        return ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [Ellipse(*self._ellipse(obs))])
+        return self._coefficients(obs).written
+
+    def _coefficients(self, obs: Tensor) -> At:
+        ellipse = self._ellipse(obs)
+        written = ExplicitSet(obs.new_zeros(0, self.dim), obs.new_zeros(0), [Ellipse(*ellipse)])
+        return At(obs, list(ellipse), lambda: written)
 
     def _ellipse(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Q, c and the bound, checked."""
@@ -65,27 +69,22 @@ class QuadraticConstraint(GeneralConstraint):
         matrix = checked(self.Q(obs), "Q(obs)", (self.dim, self.dim), obs)
         center = checked(self.c(obs), "c(obs)", (self.dim,), obs)
         bound = checked(self.bound(obs), "bound(obs)", (), obs)
-        name = name_samples(tuple(matrix.shape[:-2]))
-        largest = matrix.abs().flatten(-2).amax(-1)
-        skew = (matrix - matrix.mT).abs().flatten(-2).amax(-1)
-        require((skew <= _ROUNDING * largest).flatten(), "Q(obs) is not symmetric", name)
+        least = check_semidefinite(matrix.detach(), "Q(obs)")
         matrix = 0.5 * (matrix + matrix.mT)
-        least = torch.linalg.eigvalsh(matrix)[..., 0]
-        require((least >= -_ROUNDING * largest).flatten(), "Q(obs) is not positive semi-definite", name)
-        matrix = matrix + (-least.detach()).clamp(min=0.0)[..., None, None] * torch.eye(
+        matrix = matrix + (-least).clamp(min=0.0)[..., None, None] * torch.eye(
             self.dim, dtype=matrix.dtype, device=matrix.device
         )
         require((bound > 0.0).flatten(), "bound(obs) is not positive", name_samples(tuple(bound.shape)))
         return matrix, center, bound
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        matrix, center, bound = self._ellipse(obs)
+    def _violation(self, at: At | Tensor, action: Tensor) -> Tensor:
+        matrix, center, bound = self.at(at)
         offset = action - center
         value = (offset * times(matrix, offset)).sum(-1)
         return ellipse_excess(value, matrix.diagonal(dim1=-2, dim2=-1).sum(-1), bound, self.dim)
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        matrix, middle, bound = self._ellipse(obs)
+    def _part_gauges(self, at: At, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        matrix, middle, bound = at
         offset = (-middle if center is None else center - middle).expand_as(direction)
         bent = times(matrix, offset)
         inside = (bent * offset).sum(-1) < bound * (1.0 - ON_BOUNDARY)

@@ -44,6 +44,11 @@ class ScaledSets:
         return self.rows.shape[1] - 2 * self.dim
 
     @property
+    def given(self) -> Tensor:
+        """Which rows (m,) are not the box's."""
+        return torch.arange(self.rows.shape[1], device=self.rows.device) < self.given_rows
+
+    @property
     def curved(self) -> bool:
         """Whether there are ellipses."""
         return self.matrix.shape[1] > 0
@@ -62,6 +67,11 @@ class ScaledSets:
             self.root[index],
             self.name.part(index.tolist()),
         )
+
+    def detach(self) -> ScaledSets:
+        """The sets without the graph of their coefficients."""
+        matrix, center, root = self.matrix.detach(), self.center.detach(), self.root.detach()
+        return ScaledSets(self.rows.detach(), self.bounds.detach(), matrix, center, root, self.name)
 
     def ellipse_values(self, point: Tensor) -> tuple[Tensor, Tensor]:
         """Values (n, k) of the ellipses at the point (n, d), inside where <= 1, and their gradients (n, k, d)."""
@@ -99,8 +109,8 @@ class ScaledSets:
         return matrix, torch.nn.functional.pad(offset, (1, 0), value=1.0)
 
 
-def scale_sets(written: ExplicitSet, lead: tuple[int, ...]) -> ScaledSets:
-    """The sets of a batch of shape `lead`. A ConstraintError names a row that no point of the box meets."""
+def scale_sets(written: ExplicitSet, lead: tuple[int, ...], check: bool = True) -> ScaledSets:
+    """The sets of a batch of shape `lead`. An EmptySetError names a row that no point of the box meets, if `check`."""
     rows, bounds = unit_rows(written.rows, written.bounds)
     m, d = rows.shape[-2:]
     count = math.prod(lead)
@@ -109,12 +119,13 @@ def scale_sets(written: ExplicitSet, lead: tuple[int, ...]) -> ScaledSets:
     # A row that touches the box in a face, an edge or a corner is met there.
     reach = rows.abs().sum(-1)
     met = torch.where(reach > 0.0, bounds >= -reach - EMPTY, bounds >= 0.0)
-    require(met, "the set is empty", name_samples(tuple(lead)), EmptySetError)
+    if check:
+        require(met, "the set is empty", name_samples(tuple(lead)), EmptySetError)
     # 0 <= 0 holds everywhere, with slack.
     bounds = torch.where((rows == 0.0).all(-1) & (bounds == 0.0), 1.0, bounds)
-    faces = torch.eye(d, dtype=rows.dtype).expand(len(rows), d, d)
+    faces = torch.eye(d, dtype=rows.dtype, device=rows.device).expand(len(rows), d, d)
     rows = torch.cat((rows, faces, -faces), 1)
-    bounds = torch.cat((bounds, torch.ones(len(rows), 2 * d, dtype=rows.dtype)), 1)
+    bounds = torch.cat((bounds, rows.new_ones(len(rows), 2 * d)), 1)
     scaled = []
     for matrix, center, limit in written.ellipses:
         bound = torch.as_tensor(limit, dtype=rows.dtype, device=matrix.device)

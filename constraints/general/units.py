@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from constraints.base import Constraint, Ellipse, ExplicitSet
-from constraints.general.base import GeneralConstraint
+from constraints.general.base import At, GeneralConstraint
 from constraints.general.intersection import Intersection
 from constraints.general.linear import LinearConstraint
 from constraints.general.quadratic import QuadraticConstraint
@@ -38,6 +38,18 @@ class InUnits(GeneralConstraint):
         self.half = ((most - least) / 2.0).expand(self.dim)
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
+        return self._coefficients(obs).written
+
+    def _coefficients(self, obs: Tensor) -> At:
+        written = self._normalised(obs)
+        rows, bounds, ellipses = written
+        linear: list[Constraint] = [LinearConstraint(self.dim, lambda _: rows, lambda _: bounds)]
+        # The set at these observations alone, as the intersection of its rows and its ellipses.
+        normalised = Intersection(*linear, *(_constant_ellipse(self.dim, ellipse) for ellipse in ellipses))
+        at = normalised._coefficients(obs)
+        return At(obs, list(at), lambda: written, (normalised, at))
+
+    def _normalised(self, obs: Tensor) -> ExplicitSet:
         middle, half = self.middle.to(obs.device), self.half.to(obs.device)
         rows, bounds, ellipses = self.constraint.explicit(obs)
         scaled = [
@@ -46,21 +58,17 @@ class InUnits(GeneralConstraint):
         ]
         return ExplicitSet(rows * half, bounds - rows @ middle, scaled)
 
-    def _violation(self, obs: Tensor, action: Tensor) -> Tensor:
-        return self._written_out(obs)._violation(obs, action)
+    def _violation(self, at: At | Tensor, action: Tensor) -> Tensor:
+        normalised, own = self.at(at).parts
+        return normalised._violation(own, action)
 
-    def _penalty(self, obs: Tensor, action: Tensor) -> Tensor:
-        return self._written_out(obs)._penalty(obs, action)
+    def _penalty(self, at: At | Tensor, action: Tensor) -> Tensor:
+        normalised, own = self.at(at).parts
+        return normalised._penalty(own, action)
 
-    def _gauge_gradients(self, obs: Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        return self._written_out(obs)._gauge_gradients(obs, direction, center)
-
-    def _written_out(self, obs: Tensor) -> Constraint:
-        """The set at `obs` alone, as the intersection of its rows and its ellipses."""
-        rows, bounds, ellipses = self.explicit(obs)
-        parts: list[Constraint] = [LinearConstraint(self.dim, lambda _: rows, lambda _: bounds)]
-        parts += [_constant_ellipse(self.dim, ellipse) for ellipse in ellipses]
-        return Intersection(*parts)
+    def _part_gauges(self, at: At, direction: Tensor, center: Tensor | None) -> list[Tensor]:
+        normalised, own = at.parts
+        return normalised._part_gauges(own, direction, center)
 
 
 def _constant_ellipse(dim: int, ellipse: Ellipse) -> QuadraticConstraint:

@@ -11,7 +11,6 @@ A logger that fails is named once and left out, and the training goes on.
 
 from __future__ import annotations
 
-import importlib
 import math
 import os
 import sys
@@ -28,12 +27,16 @@ PROJECT = "action-constrained-rl"
 """The project on Weights & Biases, unless WANDB_PROJECT names another."""
 
 
-class MissingPackageError(Exception):
-    """The package of a logger is not installed. The message is one line with pip's command."""
+class LoggerError(Exception):
+    """A logger cannot start: its package or a login is missing. The message is one line with the remedy."""
 
 
 class Logger(Protocol):
     """Takes the numbers of one run; steps never descend. It may raise any error."""
+
+    @staticmethod
+    def check() -> None:
+        """Raise ImportError or LoggerError if it cannot start."""
 
     def log(self, step: int, values: Mapping[str, float]) -> None: ...
 
@@ -41,7 +44,14 @@ class Logger(Protocol):
 
 
 class TensorBoard:
-    """Writes event files. Those of an earlier process count below `first_step` only."""
+    """Writes event files. Those of an earlier process count below `first_step` only.
+
+    PyTorch writes them with the package `tensorboard`, which also shows them.
+    """
+
+    @staticmethod
+    def check() -> None:
+        import torch.utils.tensorboard  # noqa: F401
 
     def __init__(self, folder: Path, config: Mapping[str, Any], first_step: int):
         from torch.utils.tensorboard import SummaryWriter
@@ -59,6 +69,15 @@ class TensorBoard:
 
 class WeightsAndBiases:
     """Logs a run of its own for each seed. Steps that it has already are ignored by Weights & Biases itself."""
+
+    @staticmethod
+    def check() -> None:
+        import wandb
+
+        try:
+            wandb.login()  # asks for the key in a terminal: now, and not in the middle of the training
+        except wandb.Error as error:
+            raise LoggerError(f"log=wandb: {one_line(error)} (WANDB_MODE=offline needs no login)") from error
 
     def __init__(self, folder: Path, config: Mapping[str, Any], first_step: int):
         import wandb
@@ -87,8 +106,7 @@ class WeightsAndBiases:
 
 
 LOGGERS: dict[str, Any] = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}
-MODULES = {"tensorboard": "torch.utils.tensorboard", "wandb": "wandb"}
-"""What each logger imports. PyTorch writes the files with the package `tensorboard`, which also shows them."""
+"""By the name of the package and in `log`: made with folder, settings and first step of a run."""
 
 
 def logger_names(text: str) -> list[str]:
@@ -97,14 +115,12 @@ def logger_names(text: str) -> list[str]:
 
 
 def check_loggers(names: Iterable[str]) -> None:
-    """Raise MissingPackageError if the package of a logger cannot be imported."""
+    """Raise LoggerError if a logger cannot start."""
     for name in names:
         try:
-            importlib.import_module(MODULES[name])
+            LOGGERS[name].check()
         except ImportError as error:
-            raise MissingPackageError(
-                f"log={name} needs the package {name} ({one_line(error)}): pip install {name}"
-            ) from error
+            raise LoggerError(f"log={name} needs the package {name} ({one_line(error)}): pip install {name}") from error
 
 
 class Loggers:

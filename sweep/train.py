@@ -22,7 +22,7 @@ from store.checkpoint import Checkpoint, CheckpointFolder, FormatError, group_ch
 from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
 from store.interrupt import Interrupted
 from store.lock import run_lock
-from store.loggers import MissingPackageError, check_loggers, logger_names
+from store.loggers import LoggerError, check_loggers, logger_names
 from store.output import forgiving_output
 from store.provenance import command_line, describe_environment
 from sweep.cells import Cell, make_cells
@@ -161,7 +161,7 @@ def check_log(text: str) -> None:
     """Raise ConfigError if a logger of `text`, a value of `log`, cannot work here."""
     try:
         check_loggers(logger_names(text))
-    except MissingPackageError as error:
+    except LoggerError as error:
         raise ConfigError(str(error)) from error
 
 

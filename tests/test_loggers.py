@@ -129,7 +129,7 @@ except ZeroDivisionError:
     assert len(names) == 2  # the seeds are runs of their own
 
 
-@pytest.mark.parametrize("name, module", loggers.MODULES.items())
+@pytest.mark.parametrize("name, module", [("tensorboard", "torch.utils.tensorboard"), ("wandb", "wandb")])
 @pytest.mark.parametrize("more", ["", "jobs=2"])
 def test_a_missing_package_is_one_line_before_the_training(tmp_path, monkeypatch, capsys, name, module, more):
     monkeypatch.setitem(sys.modules, module, None)  # importing it fails
@@ -138,6 +138,19 @@ def test_a_missing_package_is_one_line_before_the_training(tmp_path, monkeypatch
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and f"log={name} needs the package {name}" in said and f"pip install {name}" in said
     assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_login_is_one_line_before_the_training(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("WANDB")}
+    environment |= {"HOME": str(tmp_path), "NETRC": str(tmp_path / "netrc")}
+    words = f"algo=DRad {WORDS} log=wandb results={tmp_path / 'results'}"
+    process = subprocess.run(
+        [sys.executable, "run.py", *words.split()],
+        env=environment, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert process.returncode == 2 and process.stderr.count("\n") == 1, process.stderr
+    assert "run.py: log=wandb: No API key configured" in process.stderr and "WANDB_MODE=offline" in process.stderr
+    assert not (tmp_path / "results").exists()
 
 
 @pytest.mark.parametrize("value", ["tensorbord", "csv,", "wandb;csv", "[csv]"])
@@ -166,11 +179,13 @@ class Failing:
 
     close = log
 
+    def check(self):
+        pass
+
 
 @pytest.mark.parametrize("calls", [0, 3])
 def test_a_logger_that_fails_is_named_once_and_the_training_goes_on(tmp_path, monkeypatch, capsys, calls):
     monkeypatch.setitem(loggers.LOGGERS, "wandb", Failing(calls))
-    monkeypatch.setitem(loggers.MODULES, "wandb", "csv")
     assert run_command(f"algo=DRad {WORDS} seed=3 log=wandb,tensorboard results={tmp_path}".split()) == 0
     (folder,) = find_runs(tmp_path)
     said = [line for line in capsys.readouterr().err.splitlines() if "log=wandb" in line]
@@ -182,7 +197,6 @@ def test_a_logger_that_fails_is_named_once_and_the_training_goes_on(tmp_path, mo
 def test_a_logger_that_fails_at_the_end_leaves_the_result(tmp_path, monkeypatch, capsys):
     calls = 1 + 6 + 4 + 1  # opening, evaluations, training, result
     monkeypatch.setitem(loggers.LOGGERS, "wandb", Failing(calls))
-    monkeypatch.setitem(loggers.MODULES, "wandb", "csv")
     assert run_command(f"algo=DRad {WORDS} seed=3 log=wandb results={tmp_path}".split()) == 0
     assert "log=wandb ends after step 60" in capsys.readouterr().err
     assert read_run(*find_runs(tmp_path)).finished

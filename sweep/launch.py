@@ -32,8 +32,8 @@ def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None
         cells = [Cell.of(replace(cell.config, device=device)) for cell in cells]
     cells = [Cell.of(on_this_machine(cell.config, threads)) for cell in cells]
     settings = cells[0].config  # one command has one device, and overwrites all cells or none
+    check_log(settings.log)  # jobs of Slurm have the same Python and home
     if not on_slurm:
-        check_log(settings.log)
         check_device(settings.device)
         for task, simulator in {(cell.task, cell.config.simulator) for cell in cells if cell.config.simulator}:
             make_env(task, simulator).close()  # where it is not installed, no cell should start

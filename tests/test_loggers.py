@@ -130,7 +130,7 @@ except ZeroDivisionError:
 
 
 @pytest.mark.parametrize("name, module", [("tensorboard", "torch.utils.tensorboard"), ("wandb", "wandb")])
-@pytest.mark.parametrize("more", ["", "jobs=2"])
+@pytest.mark.parametrize("more", ["", "jobs=2", "launcher=slurm"])
 def test_a_missing_package_is_one_line_before_the_training(tmp_path, monkeypatch, capsys, name, module, more):
     monkeypatch.setitem(sys.modules, module, None)  # importing it fails
     words = f"algo=DRad {WORDS} log=csv,{name} results={tmp_path} {more}"

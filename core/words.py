@@ -29,14 +29,21 @@ class NameTable(MutableMapping[str, Row]):
         self.kind, self._rows = kind, dict[str, Row]()
 
     def __setitem__(self, name: str, row: Row) -> None:
-        if name in self._rows:
-            raise ValueError(f"the {self.kind} {name!r} exists: take another name, or delete it first")
+        self.check_free(name)
         if not isinstance(name, str) or not re.fullmatch(r"[^\s,/\\=.][^\s,/\\=]*", name) or name in GROUPS:
             raise ValueError(
                 f"{name!r} cannot be the name of a {self.kind}: no space, comma, '=' or slash, no leading '.', and none"
                 f" of {', '.join(GROUPS)}"
             )
         self._rows[name] = row
+
+    def check_free(self, name: str) -> None:
+        """Raise ValueError if there is a row `name`."""
+        if name in self._rows:
+            raise ValueError(f"the {self.kind} {name!r} exists: take another name, or delete it first")
+
+    def __repr__(self) -> str:
+        return repr(self._rows)
 
     def __ior__(self, rows: Mapping[str, Row]) -> NameTable[Row]:
         self.update(rows)

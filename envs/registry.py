@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, MutableMapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +11,7 @@ import gymnasium
 from gymnasium.envs.registration import WrapperSpec
 
 from constraints import Constraint
+from core.words import NameTable
 from envs.check import check_class
 from envs.robot import Robot
 
@@ -70,7 +70,7 @@ def gymnasium_id(name: str) -> str:
     return f"acrl/{name.replace('+', '-')}-v0"
 
 
-class Tasks(MutableMapping[str, Task]):
+class Tasks(NameTable[Task]):
     """The table of tasks, name -> `Task`. A new row is checked and registered with Gymnasium.
 
     A name consists of letters, digits and the signs + - _ . and begins with a letter or a digit. Raises ValueError
@@ -79,19 +79,7 @@ class Tasks(MutableMapping[str, Task]):
     """
 
     def __init__(self) -> None:
-        self._rows: dict[str, Task] = {}
-
-    def __getitem__(self, name: str) -> Task:
-        return self._rows[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._rows)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __repr__(self) -> str:
-        return repr(self._rows)
+        super().__init__("task")
 
     def __setitem__(self, name: str, task: Task) -> None:
         if not isinstance(name, str) or not re.fullmatch(r"[^\W_][\w+.-]*", name) or name.lower() in _NOT_NAMES:
@@ -101,12 +89,11 @@ class Tasks(MutableMapping[str, Task]):
             )
         if not isinstance(task, Task):
             raise TypeError(f"the row {name} of envs.TASKS is an envs.Task, got {task!r}")
-        if name in self._rows:
-            raise ValueError(f"there is a task {name} already; take another name, or del envs.TASKS[{name!r}] first")
+        self.check_free(name)
         identifier = gymnasium_id(name)
         before = gymnasium.registry.get(identifier)
         if before is not None and before.kwargs.get("task") != name:
-            other = next((other for other in self._rows if gymnasium_id(other) == identifier), "another package")
+            other = next((other for other in self if gymnasium_id(other) == identifier), "another package")
             raise ValueError(f"the task {name} would have the identifier {identifier}, which {other} has already")
         gymnasium.registry.pop(identifier, None)  # this row, where the module is loaded for the second time
         gymnasium.register(
@@ -116,10 +103,10 @@ class Tasks(MutableMapping[str, Task]):
             additional_wrappers=(WrapperSpec("GivenTimeLimit", "envs.constrained:GivenTimeLimit", {}),),
             kwargs={"task": name},
         )
-        self._rows[name] = task
+        super().__setitem__(name, task)
 
     def __delitem__(self, name: str) -> None:
-        del self._rows[name]
+        super().__delitem__(name)
         del gymnasium.registry[gymnasium_id(name)]
 
 

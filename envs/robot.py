@@ -40,7 +40,15 @@ class Robot(ABC):
     """The group of robots in the paper's table of hyperparameters whose values algorithms take."""
     simulators: Mapping[str, str] = {}
     """The simulators among which a user can choose: name -> "module:class", imported when chosen. The first is this
-    class itself; a robot without a choice has none."""
+    class itself; a robot without a choice has none. A class that derives from a robot does not inherit them."""
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if "simulators" not in vars(cls):
+            cls.simulators = {}  # those of the base class would run the base class
+        if "step" in vars(cls) and "step_together" not in vars(cls):
+            # A faster way to take the base class's step is not one to take this step.
+            cls.step_together = classmethod(Robot.step_together.__func__)  # type: ignore[assignment, attr-defined]
 
     @abstractmethod
     def reset(self, rng: np.random.Generator) -> np.ndarray:

@@ -125,7 +125,7 @@ def test_an_end_that_cannot_be_read_is_not_run_over(capsys, tmp_path, name, cont
     run_command(f"algo=DPre env=R+N {WORDS} results={tmp_path}".split())
     out = capsys.readouterr().out
     assert out.startswith(f"{folder}: already finished, but unreadable ({folder / name}: ") and out.count("\n") == 1
-    assert (folder / name).read_text() == content and len(list(folder.iterdir())) == 1
+    assert (folder / name).read_text() == content and len(list(folder.iterdir())) == 2
 
 
 # ---------------------------------------------------------------- constraints

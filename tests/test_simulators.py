@@ -8,9 +8,18 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
+from helpers import run_command
+
+import envs
+from constraints import Ball
+from envs import TASKS, Task
+from envs.locomotion import HalfCheetah
+from envs.reacher import MANY, Reacher
+from store.folder import read_results
 
 ROOT = Path(__file__).resolve().parent.parent
 SHORT = "learning_starts=16 batch_size=4 hidden=[8] eval_every=30 eval_episodes=1 final_episodes=1"
@@ -123,3 +132,35 @@ def test_a_resumed_run_tells_that_its_threads_have_changed(tmp_path):
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 143
     assert "resuming from step" in said[0] and "threads=1 now, 2 before: equal up to rounding" in said[1]
+
+
+class SlowArm(Reacher):
+    def step(self, action):
+        obs, reward, terminated, info = super().step(0.0 * action)
+        return obs, reward - 7.0, terminated, info
+
+
+class SlowCheetah(HalfCheetah):
+    def step(self, action):
+        obs, reward, terminated, info = super().step(0.0 * action)
+        return obs, reward - 7.0, terminated, info
+
+
+def test_a_class_that_derives_from_a_robot_runs_itself(tmp_path, monkeypatch):
+    """Its base class's choice of simulators names the base class."""
+    monkeypatch.setitem(TASKS, "R+Slow", Task(SlowArm, Ball(0.05, 2), "", "", 40))
+    assert isinstance(envs.make("R+Slow").robot, SlowArm)
+    words = "algo=DPre env=R+Slow steps=40 learning_starts=30 batch_size=4 hidden=[4] eval_every=20 eval_episodes=1"
+    assert run_command([*words.split(), "final_episodes=1", f"results={tmp_path}"]) == 0
+    (run,) = read_results(tmp_path)[0]
+    assert run.result["return_mean"] < -6.0 * 150 and run.config["simulator"] is None
+
+
+@pytest.mark.parametrize("robot", [SlowArm, SlowCheetah])
+def test_a_step_that_a_derived_class_changes_is_also_taken_together(robot):
+    """Where the base class has a faster way for many, too."""
+    robots = [robot() for _ in range(MANY)]
+    for number, each in enumerate(robots):
+        each.reset(np.random.default_rng(number))
+    rewards = [step[1] for step in robot.step_together(robots, np.ones((MANY, robot.action_dim)))]
+    assert max(rewards) < -3.0

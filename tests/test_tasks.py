@@ -117,7 +117,7 @@ def test_every_way_into_the_table_is_checked(table):
 
 def test_a_taken_name_is_not_replaced(table):
     before = table["R+L2"]
-    with pytest.raises(ValueError, match=r"there is a task R\+L2 already"):
+    with pytest.raises(ValueError, match=r"the task 'R\+L2' exists: take another name"):
         table["R+L2"] = Task(**ROW)
     with pytest.raises(ValueError, match=r"identifier acrl/R-L2-v0, which R\+L2 has already"):
         table["R-L2"] = Task(**ROW)

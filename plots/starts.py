@@ -87,7 +87,9 @@ def adjusted_table(groups: Groups) -> Table:
         rows = []
         for condition in conditions:
             for algo in order_algos(groups[condition]):
-                runs = [run for run in groups[condition][algo] if run.result and is_on_reacher(run)]
+                runs = [
+                    run for run in groups[condition][algo] if is_on_reacher(run) and "returns" in (run.result or {})
+                ]
                 if not runs:
                     continue
                 plain = [np.array(run.result["returns"]) for run in runs]

@@ -16,7 +16,7 @@ from sweep.plan import describe_plan, make_plan, memory_warning
 from sweep.settings import Sweep
 from sweep.slurm import asks_for_gpus, check_gpus, submit
 from sweep.states import job_states
-from sweep.train import check_device, make_env, on_this_machine
+from sweep.train import check_device, check_log, make_env, on_this_machine
 
 
 def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None]) -> Exit:
@@ -32,6 +32,7 @@ def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None
         cells = [Cell.of(replace(cell.config, device=device)) for cell in cells]
     cells = [Cell.of(on_this_machine(cell.config, threads)) for cell in cells]
     settings = cells[0].config  # one command has one device, and overwrites all cells or none
+    check_log(settings.log)  # jobs of Slurm have the same Python and home
     if not on_slurm:
         check_device(settings.device)
         for task, simulator in {(cell.task, cell.config.simulator) for cell in cells if cell.config.simulator}:

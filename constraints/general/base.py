@@ -14,11 +14,12 @@ from constraints.checks import ON_BOUNDARY
 from constraints.ellipse import ellipse_gauge_gradient
 from constraints.errors import ConstraintError, EmptySetError, name_samples, require
 from constraints.general.active_set import project_on_rows
-from constraints.general.centers import deep_points, guessed_points, interior_points, least_excess, widened
+from constraints.general.centers import deep_points, interior_points
+from constraints.general.depth import least_excess, widened
 from constraints.general.derivatives import projection_jacobian, with_derivatives
 from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.projection import closest_points, optimal_points
-from constraints.general.scaled_sets import ScaledSets, scale_sets
+from constraints.general.scaled_sets import ScaledSets, guessed_points, scale_sets
 from constraints.jacobian import JacobianProduct
 from constraints.numerics import is_traced, times
 

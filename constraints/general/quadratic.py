@@ -21,11 +21,12 @@ class QuadraticConstraint(GeneralConstraint):
     """(a - c(obs))' Q(obs) (a - c(obs)) <= bound(obs) in the box [-1, 1]^dim, Q positive semi-definite, bound > 0.
 
     Pass Q, bound (a function or a number) and c (default: the origin), or override them in a subclass; TypeError where
-    Q or bound is missing. `center` is c, the point deepest in the set where c is not inside the box, and a mean of both
-    where c is near its boundary. Methods raise a ConstraintError that names the sample for NaN or infinite observations
-    or coefficients, wrong shapes, a Q that is not positive semi-definite, a bound that is not positive, and an empty
-    set. A set without interior is nowhere deeper than 1e-9: `center`, and methods that need one, raise for it,
-    `project` and `linear_oracle` only where it leaves no unique multipliers.
+    Q or bound is missing. `center` is c. Where c is not inside the box, it is the point nearest to c of those at least
+    0.9 times as deep in the set as the deepest; where c is near the box's boundary, a mean of both. It is continuous in
+    the coefficients. Methods raise a ConstraintError that names the sample for NaN or infinite observations or
+    coefficients, wrong shapes, a Q that is not positive semi-definite, a bound that is not positive, and an empty set.
+    A set without interior is nowhere deeper than 1e-9: `center`, and methods that need one, raise for it, `project` and
+    `linear_oracle` only where it leaves no unique multipliers.
     """
 
     def __init__(

@@ -118,6 +118,14 @@ def test_center_of_a_long_ellipse_that_turns_outside_the_box(width):
     assert center.diff(dim=0).norm(dim=-1).max() <= 0.02
 
 
+def test_several_centres_for_one_action():
+    constraint = fixed(torch.eye(2, dtype=torch.float64), torch.full((2,), 0.5))
+    obs, action, center = torch.zeros(3), torch.ones(2), torch.tensor([[0.0, 0.0], [0.2, 0.0], [-0.5, 0.1]])
+    for method in (constraint.gauge, constraint.alpha_map, constraint.gauge_map):
+        expected = torch.stack([method(obs, action, each) for each in center])
+        torch.testing.assert_close(method(obs, action, center), expected)
+
+
 def test_a_small_turn_is_a_small_step():
     """The radial map of one action moves with the slab, as its projection does."""
     rows, bounds = both_sides(torch.stack((turning(2, 0.01)[1] * 0.5**0.5).unbind(), 0), -0.1, 0.1)

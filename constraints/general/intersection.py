@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from constraints.base import Constraint, ExplicitSet
+from constraints.base import Constraint, ExplicitSet, OnEmpty
 from constraints.checks import ON_BOUNDARY
 from constraints.errors import name_samples, require
-from constraints.general.base import At, GeneralConstraint, OnEmpty, check_obs
+from constraints.general.base import At, GeneralConstraint, check_obs
 from constraints.implicit import tensors_of
 
 

@@ -211,8 +211,8 @@ def test_constraints_that_cannot_be_made(make, said):
 def test_a_constraint_that_breaks_down_later_says_where(capsys, tmp_path, monkeypatch):
     def bound(obs):
         calls.append(len(obs))
-        # Projections and the environment's checks take turns; the first call that finds no set is a projection's.
-        return ones(obs, 1) * (1.0 if len(calls) < 42 else -5.0)
+        # After one comparison, projections and the environment's checks take turns; a projection is the first to fail.
+        return ones(obs, 1) * (1.0 if len(calls) < 43 else -5.0)
 
     calls = []
     monkeypatch.setitem(TASKS, "R+X", Task(Reacher, rows(lambda o: ones(o, 1, 2), bound), "a task", "a formula", 20))

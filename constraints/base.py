@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import operator
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from constraints.checks import ON_BOUNDARY, check_tensor
+from constraints.checks import ON_BOUNDARY, check_precision, check_tensor
 from constraints.coefficients import FirstCalls
 from constraints.errors import name_samples, require
 from constraints.gauge import box_gauge_gradient, largest_gauge
@@ -28,6 +28,8 @@ from constraints.jacobian import JacobianProduct, with_jacobian
 from constraints.numerics import is_traced, keep_nan, one_where_zero, refuse_transforms, with_gradient
 from constraints.ray import Ray
 from constraints.sample import hit_and_run
+
+OnEmpty = Literal["error", "least"]
 
 AT_FACE = 1.0 - 1e-9
 """The box holds a coordinate of a projection that is at least this large: rounding may have moved it off the face."""
@@ -58,7 +60,7 @@ class Constraint(ABC):
 
     origin_centered: bool = True
     """True where `center(obs)` is the origin for every obs, so that no centre needs to be stored."""
-    on_empty: str = "error"
+    on_empty: OnEmpty = "error"
     """What happens where no action meets the constraint, "error" or "least"; see `GeneralConstraint`."""
     solved_on_cpu: bool = False
     """True where a solver runs on the CPU, so that a GPU has to wait. No CUDA graph can hold such a set."""
@@ -179,6 +181,7 @@ class Constraint(ABC):
 
     def least_violation(self, obs: Tensor) -> Tensor:
         """The least violation (...) that an action in the box can have, at obs (..., n); 0 if the set has one."""
+        check_tensor("obs", obs)
         return obs.new_zeros(obs.shape[:-1])  # closed forms contain the origin
 
     def center(self, obs: Tensor) -> Tensor:
@@ -188,8 +191,7 @@ class Constraint(ABC):
         The classes of sets of one's own say what theirs is.
         """
         check_tensor("obs", obs)
-        if not obs.is_floating_point():
-            raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
+        check_precision("observations", obs)
         if self.origin_centered:
             return obs.new_zeros(*obs.shape[:-1], self.dim)
         center = self._center(self._at(obs.double()))
@@ -246,10 +248,12 @@ class Constraint(ABC):
 
     def radial_log_prob(self, obs: Tensor, action: Tensor, log_prob: Tensor, center: Tensor | None = None) -> Tensor:
         """Log-density (...) of `radial_map(obs, action)`, given the log-density `log_prob` (...) of `action`."""
+        check_tensor("log_prob", log_prob)
         return self.ray(obs, action, center).radial_log_prob(log_prob)
 
     def gauge_log_prob(self, obs: Tensor, action: Tensor, log_prob: Tensor, center: Tensor | None = None) -> Tensor:
         """Log-density (...) of `gauge_map(obs, action)`, given the log-density `log_prob` (...) of `action`."""
+        check_tensor("log_prob", log_prob)
         return self.ray(obs, action, center).gauge_log_prob(log_prob)
 
     def alpha_log_prob(
@@ -260,6 +264,8 @@ class Constraint(ABC):
         With respect to volume where `action` is feasible, to the boundary's surface measure where it is not.
         Source: paper, "alpha-projection with SAC", with the solid angle of dimension d.
         """
+        check_tensor("mean", mean)
+        check_tensor("std", std)
         return self.ray(obs, action, center).alpha_log_prob(mean, std)
 
     def linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
@@ -280,12 +286,13 @@ class Constraint(ABC):
     def sample(self, obs: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
         """Feasible points (..., count, d), uniform in each set A(obs), in the dtype of `obs`.
 
-        Random numbers come from `generator`, or from PyTorch's default one. ValueError for count < 1.
+        Random numbers come from `generator`, or from PyTorch's default one. A set without a closed form takes 4 d
+        (d + 4) steps of two gauges each, which is long from d = 30 on. ValueError for count < 1.
         """
-        if count < 1:
+        if operator.index(count) < 1:
             raise ValueError(f"count must be at least 1, got {count}")
-        if not obs.is_floating_point():
-            raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
+        check_tensor("obs", obs)
+        check_precision("observations", obs)
         with torch.no_grad():
             return self._sample(obs.detach().double(), count, generator).to(obs.dtype)
 
@@ -326,8 +333,7 @@ class Constraint(ABC):
         check_tensor("action", action)
         if action.shape[-1:] != (self.dim,):
             raise ValueError(f"expected {self.dim} action coordinates, got shape {tuple(action.shape)}")
-        if not action.is_floating_point():
-            raise TypeError(f"expected float32 or float64 actions, got {action.dtype}")
+        check_precision("actions", action)
         obs, action = obs.double(), action.double()
         if obs.shape[:-1] != action.shape[:-1]:
             try:

@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 import torch
 
+from constraints import Constraint
 from core.words import known_name
 from envs.drawing import draw_set
 from envs.registry import TASKS, Task
@@ -26,6 +27,13 @@ Outcome = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
 
 class InfeasibleActionError(ValueError):
     """An action lies outside the task's feasible set at the current observation, or is no action at all."""
+
+
+def allowed_violation(constraint: Constraint, obs: torch.Tensor, violation: float) -> float:
+    """The largest violation that an executed action may have at obs (n,), where one has `violation`."""
+    if violation > TOLERANCE and constraint.on_empty == "least":
+        return TOLERANCE + constraint.least_violation(obs).item()
+    return TOLERANCE
 
 
 def find_task(name: str) -> Task:
@@ -306,9 +314,7 @@ class ActionConstrainedEnv(gymnasium.Env):
             obs, exact = torch.from_numpy(self._obs), torch.from_numpy(action.astype(np.float64))
             exact = self.constraint.project(obs, exact)
             action, violation = exact.numpy(), self.constraint.violation(obs, exact).item()
-        allowed = TOLERANCE
-        if violation > TOLERANCE and self.constraint.on_empty == "least":
-            allowed += self.constraint.least_violation(torch.from_numpy(self._obs)).item()
+        allowed = allowed_violation(self.constraint, torch.from_numpy(self._obs), violation)
         if not violation <= allowed:  # a NaN is refused as well
             return InfeasibleActionError(
                 f"{self._where()}: action {action} violates the constraint by {violation:.3g} "

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from constraints import Constraint
 from core.words import known_name
-from envs.constrained import TOLERANCE, InfeasibleActionError
+from envs.constrained import InfeasibleActionError, allowed_violation
 
 MAPPINGS: dict[str, Callable[[Constraint, Tensor, Tensor], Tensor]] = {
     "project": lambda constraint, obs, action: constraint.project(obs, action),
@@ -69,6 +69,8 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             self, _disable_deepcopy=True, constraint=constraint, mapping=mapping, features=features
         )
         super().__init__(env)
+        if not isinstance(constraint, Constraint):
+            raise TypeError(f"the constraint is an object of a constraints.Constraint, got {constraint!r}")
         if mapping is not None:
             known_name("mapping", mapping, MAPPINGS)
         if features is None:
@@ -111,16 +113,17 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         action = torch.from_numpy(suggested)
         violation = self._violation(action)
         if self.mapping is None:
-            if not violation <= TOLERANCE:
-                raise InfeasibleActionError(f"action {suggested} {_excess(violation)}")
+            if not violation <= (allowed := allowed_violation(self.constraint, self._obs, violation)):
+                raise InfeasibleActionError(f"action {suggested} {_excess(violation, allowed)}")
             return suggested.copy(), violation
         if self.mapping in KEEP_FEASIBLE and violation <= 0.0:
             return suggested.copy(), violation
         mapped = MAPPINGS[self.mapping](self.constraint, self._obs, action)
-        if not (left := self._violation(mapped)) <= TOLERANCE:  # a NaN is refused as well
+        left = self._violation(mapped)
+        if not left <= (allowed := allowed_violation(self.constraint, self._obs, left)):  # a NaN is refused as well
             raise InfeasibleActionError(
-                f"{self.mapping} maps {suggested} to {mapped.numpy()}, which {_excess(left)}; the constraint does not"
-                f" work at the observation {self._obs.numpy()}"
+                f"{self.mapping} maps {suggested} to {mapped.numpy()}, which {_excess(left, allowed)}; the constraint"
+                f" does not work at the observation {self._obs.numpy()}"
             )
         return mapped.numpy(), violation
 
@@ -135,8 +138,8 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self._obs = torch.from_numpy(seen)
 
 
-def _excess(violation: float) -> str:
-    return f"violates the constraint by {violation:.3g} (at most {TOLERANCE:g} is allowed)"
+def _excess(violation: float, allowed: float) -> str:
+    return f"violates the constraint by {violation:.3g} (at most {allowed:g} is allowed)"
 
 
 def _checked_box(space: gymnasium.Space, dim: int) -> gymnasium.spaces.Box:

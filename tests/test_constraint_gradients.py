@@ -324,6 +324,18 @@ def test_vmap_of_general_sets():
     torch.testing.assert_close(exact, torch.stack(expected))
 
 
+@pytest.mark.parametrize("name", ["rows", "ellipse", "intersection"])
+def test_vmap_of_what_looks_at_values_says_so(name):
+    constraint = general(torch.ones((), dtype=torch.float64))[name]
+    obs, action = torch.rand(4, 3, dtype=torch.float64), torch.rand(4, 2, dtype=torch.float64)
+    for method in ("violation", "penalty", "contains", *MAPS[1:]):
+        with pytest.raises(RuntimeError, match="looks at values, which torch.func.vmap hides"):
+            torch.func.vmap(getattr(constraint, method))(obs, action)
+    for method in (constraint.center, constraint.least_violation):
+        with pytest.raises(RuntimeError, match="looks at values, which torch.func.vmap hides"):
+            torch.func.vmap(method)(obs)
+
+
 @every_set
 def test_second_derivatives_are_refused_or_right(name):
     """The usual case, gradients with respect to the action alone, has none; nor have projections."""

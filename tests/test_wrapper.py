@@ -373,6 +373,29 @@ def test_units_that_are_none_are_refused(low, high, said):
         InUnits(SpeedLimit(dim=1), low, high)
 
 
+def test_the_least_violating_action_of_an_empty_set_is_executed():
+    gap = LinearConstraint(
+        2, lambda obs: torch.tensor([[1.0, 0.0], [-1.0, 0.0]]), lambda obs: torch.full((2,), -0.3), on_empty="least"
+    )
+    for constraint in (gap, InUnits(gap, -1.0, 1.0)):
+        for mapping in (*MAPPINGS, None):
+            env = Constrained(Robot(), constraint, mapping)
+            env.reset()
+            if mapping is None:
+                with pytest.raises(InfeasibleActionError, match="by 0.8 .at most 0.300001 is allowed"):
+                    env.step(np.array([0.5, 0.5]))
+            suggested = np.array([0.0, 0.5]) if mapping is None else np.array([0.5, 0.5])
+            info = env.step(suggested)[4]
+            assert abs(info["executed_action"][0]) <= 1e-6
+            assert info["violation"] == pytest.approx(0.3 if mapping is None else 0.8)
+
+
+def test_what_is_no_constraint_is_refused():
+    for wrong in (Ball, None):
+        with pytest.raises(TypeError, match="the constraint is an object of a constraints.Constraint, got"):
+            Constrained(Robot(), wrong)
+
+
 def test_an_empty_set_is_reported_by_the_step():
     impossible = LinearConstraint(2, lambda obs: torch.ones(1, 2), lambda obs: torch.tensor([-3.0]))
     env = Constrained(Robot(), impossible)

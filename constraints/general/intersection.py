@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from constraints.base import Constraint, ExplicitSet
+from constraints.base import Constraint, ExplicitSet, OnEmpty
 from constraints.checks import ON_BOUNDARY
 from constraints.errors import name_samples, require
-from constraints.general.base import At, GeneralConstraint, OnEmpty, check_obs
+from constraints.general.base import At, GeneralConstraint, check_obs
 from constraints.implicit import tensors_of
 
 
@@ -21,7 +21,8 @@ class Intersection(GeneralConstraint):
     Each is a constraint of this package, a user's own with `explicit`, or another intersection; ValueError for none, or
     for different dimensions. `penalty` is the sum of their penalties, `violation` the largest violation. `center` is
     that of a LinearConstraint if all are linear. With an ellipse it is the origin where that is interior, otherwise the
-    point deepest in the set, and a mean of both where the origin is near the boundary. Methods raise a ConstraintError
+    point nearest to the origin of those at least 0.9 times as deep as the deepest, and a mean of both where the origin
+    is near the boundary. It is continuous in the coefficients. Methods raise a ConstraintError
     as those of LinearConstraint and QuadraticConstraint do.
     """
 

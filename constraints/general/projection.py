@@ -14,9 +14,9 @@ from torch import Tensor
 
 from constraints.errors import require
 from constraints.general.active_set import project_on_rows
-from constraints.general.centers import deepest_points, guessed_points
+from constraints.general.depth import deepest_points
 from constraints.general.interior_point import solve_cone_programs
-from constraints.general.scaled_sets import ScaledSets
+from constraints.general.scaled_sets import ScaledSets, guessed_points
 from constraints.numerics import one_where_zero, times
 
 # The interior-point method's accuracy. Its multipliers have to tell active constraints from others, no more.

@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
+
+import gymnasium
+from gymnasium.envs.registration import load_env_creator
 
 from algos import ALGORITHMS
 from core.words import ConfigError
@@ -19,10 +23,16 @@ def define(task: str, algo: str) -> dict[str, Description]:
     """The descriptions of the task and of the algorithm, as definition.json has them."""
     robot, algorithm = TASKS[task].robot, ALGORITHMS[algo]
     public = {name: getattr(robot, name) for name in dir(robot) if not name.startswith("_")}
-    numbers = {f"robot.{name}": value for name, value in public.items() if isinstance(value, (int, float, str))}
+    numbers = {name: value for name, value in public.items() if isinstance(value, (int, float, str))}
+    parts: dict[str, Any] = {f"robot.{name}": value for name, value in numbers.items()}
+    if isinstance(identifier := public.get("identifier"), str):  # of a Gymnasium environment, which may be one's own
+        spec = gymnasium.spec(identifier)
+        parts |= {"robot.environment": spec.entry_point, "robot.settings": spec.kwargs}
+        if isinstance(spec.entry_point, str):
+            parts["robot.environment"] = load_env_creator(spec.entry_point)
     how = {"agent": algorithm.agent, "map": algorithm.map, "placement": algorithm.placement}
     return {
-        "task": describe({"constraint": TASKS[task].constraint, "robot": robot, **numbers}),
+        "task": describe({"constraint": TASKS[task].constraint, "robot": robot, **parts}),
         "algorithm": describe({**how, "penalty": algorithm.penalty}),
     }
 

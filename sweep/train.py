@@ -50,17 +50,23 @@ def train_words(words: str) -> bool:
 
 def train_cells(cells: Sequence[Cell], stop_if_asked: Callable[[], None] = lambda: None) -> Exit:
     """Train `cells` one after the other. `stop_if_asked` raises Interrupted to end the training with a checkpoint."""
-    done = [train(cell, stop_if_asked) for cell in cells]
+    # All definitions come first: a training may change what they are of, as where a function remembers its results.
+    definitions = [define(cell.config.env, cell.config.algo) for cell in cells]
+    done = [train(cell, stop_if_asked, definition) for cell, definition in zip(cells, definitions, strict=True)]
     return Exit.DONE if all(done) else Exit.DIVERGED
 
 
-def train(cell: Cell, stop_if_asked: Callable[[], None] = lambda: None) -> bool:
+def train(
+    cell: Cell, stop_if_asked: Callable[[], None] = lambda: None, definition: dict[str, Any] | None = None
+) -> bool:
     """Train the seeds of one cell that have not ended, from their checkpoints where there are any.
+
+    `definition` is by default what the task and the algorithm stand for now.
 
     Prints each result and its folder. Returns whether every seed has a result.
     """
     config, folders = on_this_machine(cell.config), dict(zip(cell.seeds, cell.folders, strict=True))
-    definition = define(config.env, config.algo)  # before its objects are used, which may change them
+    definition = definition or define(config.env, config.algo)
     torch.set_num_threads(int(config.threads))
     check_log(config.log)
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU

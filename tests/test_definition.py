@@ -1,11 +1,19 @@
 """A run belongs to the definition of its task and algorithm that it was trained on, not to their names."""
 
+import enum
 import functools
 import json
+import math
+import operator
+import re
 import subprocess
 import sys
+import types
+from collections import deque
+from fractions import Fraction
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -14,7 +22,18 @@ from helpers import CHECKPOINTED, Breaks, run_command, train
 import plot
 from algos import ALGORITHMS, Algorithm
 from algos.td3 import TD3
-from constraints import Ball, Box, Intersection, LinearConstraint, WeightedL1
+from constraints import (
+    Ball,
+    Box,
+    DiagonalEllipse,
+    HalfSpace,
+    Intersection,
+    InUnits,
+    LinearConstraint,
+    PlanarEllipse,
+    QuadraticConstraint,
+    WeightedL1,
+)
 from core.maps import Project
 from envs import TASKS, Task
 from envs.reacher import Reacher
@@ -144,6 +163,132 @@ def test_globals_count(monkeypatch):
     assert differences(before, describe({"value": uses_a_global})) == "the value's SCALE: 2.0 then, 3.0 now"
 
 
+MODE = enum.Enum("Mode", {"TIGHT": 0.1})
+
+
+@pytest.mark.parametrize(
+    "before, now",
+    [
+        (2, 3),  # small numbers and texts are the same objects in the project's modules
+        ("task", "algorithm"),
+        (slice(6, 9, 2), slice(0, 3)),
+        (np.s_[..., 6:9:2], np.s_[..., :2]),
+        ({(0, 1)}, {(0, 2)}),
+        ({(0, 1): 1.0, (1, 2): 2.0}, {(0, 1): 5.0, (1, 2): 2.0}),
+        ({1: "a", "1": "b"}, {1: "c", "1": "b"}),
+        (deque([1]), deque([2])),
+        (Fraction(1, 2), Fraction(1, 3)),
+        (np.sin, np.cos),
+        (math.sin, math.cos),
+        (torch.nn.functional.relu, torch.nn.functional.silu),
+        (operator.itemgetter(1), operator.itemgetter(2)),
+        (torch.float32, torch.float64),
+        (torch.ones(2).mul, torch.zeros(2).mul),
+        (types.SimpleNamespace(rows=[1]), types.SimpleNamespace(rows=[2])),
+        (np.poly1d([1, 2]), np.poly1d([1, 3])),
+        (torch.distributions.Normal(0.0, 1.0), torch.distributions.Normal(0.0, 2.0)),
+        (torch.nn.Sequential(torch.nn.ReLU()), torch.nn.Sequential(torch.nn.Tanh())),
+        (np.array([None] * 20 + [1]), np.array([None] * 20 + [2])),
+        (re.compile("a"), re.compile("a", re.DOTALL)),
+        (MODE.TIGHT, enum.Enum("Mode", {"TIGHT": 0.2}).TIGHT),
+    ],
+)
+def test_any_value_counts(before, now, monkeypatch):
+    monkeypatch.setitem(globals(), "SCALE", before)
+    one = describe({"value": uses_a_global})
+    assert differences(one, describe({"value": uses_a_global})) == ""
+    other = describe({"value": now})
+    monkeypatch.setitem(globals(), "SCALE", now)
+    assert "value's SCALE" in differences(one, describe({"value": uses_a_global}))
+    assert differences(describe({"value": before}), other)
+
+
+def test_each_argument_of_a_constraint_counts():
+    def eye(obs):
+        return torch.eye(2).expand(*obs.shape[:-1], 2, 2)
+
+    one, two = scaled(1.0), scaled(2.0)
+    cases = [
+        (Ball, {"bound": 0.5, "dim": 2}, {"bound": one}),
+        (HalfSpace, {"normal": one, "bound": 1.0, "dim": 2}, {"normal": two, "bound": 2.0}),
+        (PlanarEllipse, {"matrix": eye, "bound": 1.0}, {"matrix": lambda obs: 2 * eye(obs), "bound": 2.0}),
+        (DiagonalEllipse, {"scale": one, "bound": 1.0, "dim": 2}, {"scale": two, "bound": one}),
+        (LinearConstraint, {"dim": 2, "A": eye, "b": one}, {"A": one, "b": two, "on_empty": "least"}),
+        (QuadraticConstraint, {"dim": 2, "Q": eye, "bound": 1.0}, {"Q": one, "bound": 2.0, "c": one}),
+        (InUnits, {"constraint": Ball(0.5, 2), "low": [-1, -1], "high": [1, 1]}, {"low": [-2, -1], "high": [1, 2]}),
+    ]
+    for kind, arguments, others in cases:
+        before = describe({"value": kind(**arguments)})
+        for name, value in others.items():
+            assert differences(before, describe({"value": kind(**arguments | {name: value})})), (kind, name)
+
+
+def test_lambdas_in_one_line_are_told_apart():
+    one, two = lambda obs: obs + SCALE, lambda obs: obs - SCALE
+    assert describe({"value": one})["value"] == "lambda obs: obs + SCALE"
+    assert describe({"value": two})["value"] == "lambda obs: obs - SCALE"
+
+
+def test_what_a_decorator_adds_counts():
+    def decorated(factor):
+        def decorate(function):
+            @functools.wraps(function)
+            def inner(obs):
+                return function(obs) * factor
+
+            return inner
+
+        return decorate(uses_a_global)
+
+    said = differences(describe({"value": decorated(2.0)}), describe({"value": decorated(3.0)}))
+    assert said == "the value's factor: 2.0 then, 3.0 now"
+
+
+class Computed:
+    @functools.cached_property
+    def weight(self):
+        return SCALE
+
+    @property
+    def half(self):
+        return SCALE / 2
+
+    def __call__(self, obs):
+        return times(obs, self.weight)
+
+
+def test_what_properties_use_counts_and_what_they_keep_does_not(monkeypatch):
+    value = Computed()
+    before = describe({"value": value})
+    value(torch.zeros(9))
+    assert differences(before, describe({"value": value})) == ""
+    monkeypatch.setitem(globals(), "SCALE", 3.0)
+    assert "SCALE in class Computed: 2.0 then, 3.0 now" in differences(before, describe({"value": value}))
+
+
+def test_modules_count_wherever_they_are_imported(tmp_path, monkeypatch):
+    """At the call, around the function, and where two of them import each other."""
+    (tmp_path / "own_rows").mkdir()
+    (tmp_path / "own_rows" / "__init__.py").write_text("from own_rows import table\nBOUND = 1.0\n")
+    (tmp_path / "own_rows" / "table.py").write_text("import own_rows\nROWS = 1\n")
+    (tmp_path / "own_late.py").write_text("ROWS = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    import own_rows
+
+    def late(obs):
+        import own_late
+
+        return obs * own_late.ROWS
+
+    def around(obs):
+        return obs * own_rows.table.ROWS * own_rows.table.own_rows.BOUND
+
+    before = {function: describe({"value": function}) for function in (late, around)}
+    sys.modules["own_late"].ROWS = own_rows.table.ROWS = 2
+    for function, description in before.items():
+        assert "ROWS: 1 then, 2 now" in differences(description, describe({"value": function}))
+
+
 def test_a_function_that_a_function_calls_counts(monkeypatch):
     def times(obs, factor):
         return obs[..., 6:9:2] / factor
@@ -155,7 +300,11 @@ def test_a_function_that_a_function_calls_counts(monkeypatch):
 
 
 def test_comments_and_blank_lines_do_not_count(tmp_path):
-    codes = ["def f(x):\n    return x\n", "def f(x):  # the identity\n\n    # as it says\n    return x  # x\n"]
+    codes = [
+        "def f(x):\n    return x\n",
+        "def f(x):  # the identity\n\n    # as it says\n    return x  # x\n",
+        'def f(x):\n    """The identity.\n\n    # It is."""\n\n    return x\n',
+    ]
     found = []
     for i, code in enumerate(codes):
         path = tmp_path / f"m{i}.py"
@@ -163,7 +312,7 @@ def test_comments_and_blank_lines_do_not_count(tmp_path):
         namespace = {"__name__": "nowhere"}
         exec(compile(code, str(path), "exec"), namespace)
         found.append(describe({"value": namespace["f"]})["value"])
-    assert found[0] == found[1] == "def f(x):\n    return x"
+    assert found[0] == found[1] == found[2] == "def f(x):\n    return x"
 
 
 def test_the_papers_tasks_and_algorithms_are_the_projects_own():
@@ -175,14 +324,17 @@ def test_the_papers_tasks_and_algorithms_are_the_projects_own():
 
 
 PROGRAM = """
-import json, sys, torch
+import json, logging, sys, torch
 import numpy as np
 from constraints import LinearConstraint, WeightedL1
 from store.definition import describe
 
 LIMITS = {"b": 2.0, "a": [1, 2, 3], 3: {"x", "y", "z"}}
 
+log = logging.getLogger(__name__)
+
 def weight(obs):
+    log.debug("weight of %s in %s", obs, __file__)
     return obs[..., 6:9:2] * LIMITS["b"] * max(x for x in LIMITS["a"])
 
 class Barrier(LinearConstraint):
@@ -213,6 +365,43 @@ def test_a_description_is_the_same_in_every_process(tmp_path):
             found.append(json.loads(done.stdout))
     assert all(other == found[0] for other in found) and "0x" not in json.dumps(found[0])
     assert "class Barrier" in found[0] and found[0]["one.dim"] == "2"
+
+
+def test_a_program_without_a_file(tmp_path):
+    """What comes from a pipe has no source; its code still counts, and the order of a set does not."""
+    program = """
+import json
+from constraints import WeightedL1
+from store.definition import describe
+mode = "a"
+print(json.dumps(describe({"value": WeightedL1(lambda obs: obs + (mode in {"a", "b", "c", "d"}), 0.5, 2)})))
+"""
+    found = []
+    for seed, text in (("1", program), ("2", program), ("2", program.replace("obs +", "obs -"))):
+        environment = {"PYTHONPATH": f"{ROOT}", "PYTHONHASHSEED": seed, "PATH": "/usr/bin"}
+        done = subprocess.run(
+            [sys.executable, "-"],
+            input=text,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            env=environment,
+            timeout=120,
+        )
+        assert done.returncode == 0, done.stderr
+        found.append(json.loads(done.stdout))
+    assert found[0] == found[1] != found[2]
+
+
+def test_libraries_outside_of_the_environment_are_libraries(tmp_path, monkeypatch):
+    """As on clusters, whose modules put their own folders of packages into PYTHONPATH."""
+    folder = tmp_path / "apps" / "site-packages"
+    folder.mkdir(parents=True)
+    (folder / "far_library.py").write_text("def f(x):\n    return x\n")
+    monkeypatch.syspath_prepend(folder)
+    import far_library
+
+    assert is_own(describe({"value": far_library.f}))
 
 
 @pytest.fixture
@@ -248,6 +437,50 @@ def test_a_finished_run_of_another_definition_is_not_taken_for_this_one(tmp_path
         define_task(Ball(0.9, 2), Slow)
         assert run_command(command(tmp_path)) == 2
         assert "the robot: Reacher then, Slow now" in capsys.readouterr().err
+
+
+CALLS = []
+
+
+def counts_its_calls(obs):
+    CALLS.append(1)
+    return times(obs, SCALE)
+
+
+def test_what_a_function_remembers_is_not_part_of_a_later_cell(tmp_path, capsys, define_task):
+    CALLS.clear()
+    define_task(l1(counts_its_calls))
+    both = command(tmp_path, words=WORDS.replace("algo=DPre", "algo=DPre,DOpt"))
+    assert run_command(both) == 0 and CALLS
+    CALLS.clear()  # as in another process
+    capsys.readouterr()
+    assert run_command(command(tmp_path, words=WORDS.replace("algo=DPre", "algo=DOpt"))) == 0
+    assert "already finished" in capsys.readouterr().out
+
+
+def test_an_environment_of_ones_own_counts_for_gymnasium_robot(tmp_path):
+    def environment(power):
+        class Environment(gymnasium.Env):
+            observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+            action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+            power_of_reward = power
+
+        return Environment
+
+    found = []
+    try:
+        for power, settings in ((1, {}), (2, {}), (2, {"slow": True})):
+            gymnasium.registry.pop("Own-v0", None)
+            gymnasium.register("Own-v0", entry_point=environment(power), max_episode_steps=5, kwargs=settings)
+            robot = type("Own", (Reacher,), {"identifier": "Own-v0"})
+            TASKS["R+X"] = task(Ball(0.5, 2), robot)
+            found.append(define("R+X", "DPre")["task"])
+            del TASKS["R+X"]
+    finally:
+        gymnasium.registry.pop("Own-v0", None)
+        TASKS.pop("R+X", None)
+    assert "1 then, 2 now" in differences(found[0], found[1])
+    assert "slow" in differences(found[1], found[2])
 
 
 def test_a_run_does_not_resume_under_another_definition(tmp_path, capsys, define_task):

@@ -91,7 +91,7 @@ def test_runs_that_diverged_count_with_their_best_parameters_and_are_marked(tmp_
     assert [run.seed for run in cells["R+L2"]["DPre"]] == [finished.seed, 1000]
     mean = (finished.result["return_mean"] + 1.0) / 2
     assert re.search(rf"\*\*{mean:.2f} ± [\d.]+\*\*† \(n=2\)", overview(cells))
-    assert re.search(rf"\| DPre \| {finished.seed}, 1000† \| {mean:.2f} ± [\d.]+† \| - \| 17.81", details(cells))
+    assert re.search(rf"\| DPre \| {finished.seed}, 1000† \| {mean:.2f} ± [\d.]+† \| – \| 17.81", details(cells))
 
 
 def test_a_cell_of_mixed_settings_is_refused(tmp_path):

@@ -61,8 +61,8 @@ def overview(cells: Cells) -> str:
 def details(cells: Cells) -> str:
     """The table of docs/results.md: a row a cell, with the results on Reacher adjusted for their starts."""
     rows = [
-        ["task", "algorithm", "seeds", "final result", "adjusted for the starts", "paper"],
-        ["---"] * 3 + ["---:"] * 3,
+        ["task", "algorithm", "seeds", "final result", "adjusted for the starts", "paper", "largest violation"],
+        ["---"] * 3 + ["---:"] * 4,
     ]
     for task in order_tasks(cells):
         for algo in order_algos(cells[task]):
@@ -74,7 +74,8 @@ def details(cells: Cells) -> str:
                 adjusted = statistic([float(np.mean(adjusted_returns(run))) for run in runs])
             seeds = ", ".join(f"{run.seed}{_mark([run])}" for run in runs)
             result = _text(ours, digits) + _mark(runs)
-            rows.append([task, algo, seeds, result, _text(adjusted, digits), _text(theirs, digits)])
+            violation = f"{max((run.result or run.failure)['largest_violation'] for run in runs):.1e}"
+            rows.append([task, algo, seeds, result, _text(adjusted, digits), _text(theirs, digits), violation])
     return _markdown(rows)
 
 

@@ -83,7 +83,8 @@ def test_a_run_with_other_settings_or_without_result_is_not_reproduced(tmp_path)
 def test_runs_that_diverged_count_with_their_best_parameters_and_are_marked(tmp_path):
     published = next(published for published in read_published(DATA, ["R+L2"], ["DPre"]))
     finished = published.run
-    failure = {"step": 9, "quantity": "critic loss", "result": {"return_mean": 1.0, "returns": [1.0], "best_step": 5}}
+    failure = {"step": 9, "quantity": "critic loss", "largest_violation": 2e-7}
+    failure["result"] = {"return_mean": 1.0, "returns": [1.0], "best_step": 5}
     diverged = replace(finished, seed=1000, result=None, failure=failure)
     without = replace(diverged, seed=1001, failure={"step": 9, "quantity": "critic loss"})
     write_published(tmp_path / "R+L2", [PublishedRun(run, published.info) for run in (finished, diverged, without)])
@@ -91,7 +92,9 @@ def test_runs_that_diverged_count_with_their_best_parameters_and_are_marked(tmp_
     assert [run.seed for run in cells["R+L2"]["DPre"]] == [finished.seed, 1000]
     mean = (finished.result["return_mean"] + 1.0) / 2
     assert re.search(rf"\*\*{mean:.2f} ± [\d.]+\*\*† \(n=2\)", overview(cells))
-    assert re.search(rf"\| DPre \| {finished.seed}, 1000† \| {mean:.2f} ± [\d.]+† \| – \| 17.81", details(cells))
+    assert re.search(
+        rf"\| DPre \| {finished.seed}, 1000† \| {mean:.2f} ± [\d.]+† \| – \| 17.81 ± 0.33 \| 2.0e-07 ", details(cells)
+    )
 
 
 def test_a_cell_of_mixed_settings_is_refused(tmp_path):

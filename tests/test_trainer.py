@@ -2,6 +2,7 @@
 
 import errno
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -36,6 +37,7 @@ class Scripted(gymnasium.Env):
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBS,), np.float64)
     made = 0
+    robot = SimpleNamespace(max_episode_steps=10)  # of which a progress bar asks this
 
     def __init__(self, fail=None):
         self.fail = fail  # called before every step

@@ -24,6 +24,7 @@ CORES = torch.get_num_threads()
 THREADS = {"cpu": min(CORES, 4), "cuda": min(CORES, 8)}
 """What threads=auto is for a cell that is alone on the machine. Its networks are small and fill no more than 4; beside
 a GPU the threads move MuJoCo's robots."""
+MOST_THREADS = 1024
 AUTO = "auto"
 """Stands for the fastest choice on the machine that trains."""
 
@@ -120,7 +121,11 @@ class Config:
     threads: int | str = setting(
         AUTO,
         "CPU threads; auto: a cell alone up to 4 (beside a GPU 8), in a sweep 1",
-        Rule(lambda value: value == AUTO or (isinstance(value, int) and value >= 1), "must be auto or at least 1"),
+        # (PyTorch crashes with a million)
+        Rule(
+            lambda value: value == AUTO or (isinstance(value, int) and 1 <= value <= MOST_THREADS),
+            f"must be auto or from 1 to {MOST_THREADS}",
+        ),
     )
     checkpoint_every: int = setting(10_000, "environment steps of a seed between checkpoints", AT_LEAST_ONE)
     log: str = setting(

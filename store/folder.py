@@ -115,8 +115,9 @@ def read_definition(folder: str | Path) -> dict[str, dict[str, str]] | None:
     """The definition of the task and of the algorithm in the run in `folder`; None where it has none."""
     try:
         content = _parse(Path(folder, "definition.json"), json.loads)
-        return {part: dict(content[part]) for part in ("task", "algorithm")}
-    except (ValueError, KeyError, TypeError):
+        parts = {part: content[part].items() for part in ("task", "algorithm")}
+        return {part: {key: str(text) for key, text in items} for part, items in parts.items()}
+    except (ValueError, KeyError, AttributeError):
         return None
 
 

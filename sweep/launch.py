@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from core.config import AUTO
 from core.words import ConfigError
-from sweep.cells import Cell
+from store.folder import LONGEST_NAME
+from sweep.cells import Cell, format_seeds
 from sweep.definition import check_definitions
 from sweep.exit import Exit
 from sweep.local import run_queue
@@ -41,6 +43,12 @@ def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None
         raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
     else:
         check_gpus(sweep, settings.device)
+    for cell in cells:
+        if len(os.fsencode(cell.record("log").name)) > LONGEST_NAME:
+            raise ConfigError(
+                f"seed={format_seeds(cell.seeds)} is too long for the name of a log: take seeds without gaps, or"
+                " several commands"
+            )
     check_definitions(cells)
     entries = make_plan(cells, job_states(cells))
     if sweep.settings.dry:

@@ -54,6 +54,8 @@ def refused(capsys, words):
         ("algo=DPre env=R+N seed=1e3", "bad seed '1e3'"),
         ("algo=DPre env=R+N seed=0-99999", "at most 1000 seeds"),
         ("algo=DPre env=R+N seed=1,,2", "bad seed '1,,2'"),
+        ("algo=DPre env=R+N threads=1000000", "bad value 1000000 for threads: must be auto or from 1 to 1024"),
+        (f"algo=DPre env=R+N jobs=1 seed={','.join(map(str, range(0, 200, 2)))}", "too long for the name of a log"),
         ("algo=NFW env=R+N fw_learning_rate=0", "must be in (0, 1]"),
         ("algo= env=R+N", "expected key=value, got 'algo='"),
         ("algo=DPre,all env=R+n", "did you mean R+N?"),

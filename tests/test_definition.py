@@ -531,6 +531,17 @@ def test_runs_without_a_definition(tmp_path, capsys, define_task):
     assert "does not tell on which definition" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("content", ['{"task": {"constraint": 3}, "algorithm": {}}', "[]", '{"task": []}'])
+def test_a_damaged_definition_is_no_traceback(tmp_path, capsys, define_task, content):
+    define_task(l1(scaled(1.0)))
+    assert run_command(command(tmp_path)) == 0
+    for path in tmp_path.rglob("definition.json"):
+        path.write_text(content)
+    assert run_command(command(tmp_path)) == 2
+    assert "definition of its task" in capsys.readouterr().err
+    assert plot.main([str(tmp_path), "format=csv"]) == 0
+
+
 def test_plots_keep_runs_of_two_definitions_apart(tmp_path, capsys, define_task):
     for seed, bound in (("1", 0.05), ("2", 0.9)):
         define_task(Ball(bound, 2))

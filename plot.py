@@ -9,6 +9,8 @@
                                        figures/<task>       learning curves, also of runs in progress
                                        figures/<task>-training   return and training measures, all settings
                                        figures/aggregate, figures/improvement
+    python plot.py results/ OTHER/=label ...   the same with the runs of other folders, or of CSV files with the columns
+                                     task,algorithm,seed,step,return, beside them, as "SRad (label)"
     python plot.py tables            tables/tasks and tables/hyperparameters, from the code's definitions
     python plot.py maps              figures/maps: the three feasibility maps, the paper's Figure 1
     python plot.py actions RUN       figures/actions-...: feasible set and executed actions over an episode with
@@ -37,12 +39,11 @@ from plots.aggregates import aggregate, draw_aggregates, improvement_table, mean
 from plots.conflicts import keep_apart
 from plots.figures import draw_curves
 from plots.grouping import DAGGER, Groups, group_runs, list_diverged, list_left_out
+from plots.others import Source, cells_in, parse_sources, read_source
 from plots.paper import COLORS, order_algos, order_tasks
 from plots.rewards import comparison_table, reward_table
 from plots.style import own_algos
-from store.folder import find_runs, parse_variant, read_results
 from store.output import forgiving_output
-from store.published import published_cells, read_published
 from sweep.plugins import load_plugins
 
 RESULTS = "results"
@@ -50,13 +51,16 @@ RUNTIME = "bench/results/runtime.csv"
 
 
 def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
-    """Plot all runs of a folder of results. Returns the files written."""
-    root = _path(words, "folder of results")
+    """Plot all runs of one or several folders of results. Returns the files written."""
+    if not words:
+        raise ConfigError("expected a folder of results, got none")
+    sources = parse_sources(words)
     formats = _formats(options, (*tables.FORMATS, *style.FORMATS))
     if "paper" in options:
         known_name("value of paper", options["paper"], ["beside"])
-    groups = _read(root, options)
-    out = Path(options.get("out", root)).expanduser()
+    groups = _read(sources, options)
+    first = sources[0].path
+    out = Path(options.get("out", first if first.is_dir() else first.parent)).expanduser()
     aggregates = aggregate(groups)
     left_out = list_left_out(groups)
     diverged = list_diverged(groups)
@@ -82,23 +86,26 @@ def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
     return written + draw_aggregates(aggregates, own, out / "figures", formats)
 
 
-def _read(root: Path, options: dict[str, str]) -> Groups:
-    """The runs in `root` that the options ask for. Names the unusable ones on stderr."""
-    if not root.is_dir():
-        close = closest(str(root), COMMANDS)
-        raise ConfigError(f"{root} is not a folder" + (f"; did you mean {close}?" if close else ""))
-    found = [(folder.parent.parent.name, parse_variant(folder.parent.name)[0]) for folder in find_runs(root)]
-    found += published_cells(root)
-    if not found:
-        raise ConfigError(f"no runs in {root} (looked for <task>/<algorithm>/seed=<n> and <task>/runs.csv in it)")
+def _read(sources: Sequence[Source], options: dict[str, str]) -> Groups:
+    """The runs in `sources` that the options ask for. Names the unusable ones on stderr."""
+    found: list[tuple[str, str]] = []
+    for root in (source.path for source in sources):
+        if not root.is_dir() and root.suffix != ".csv":
+            close = closest(str(root), COMMANDS)
+            raise ConfigError(f"{root} is not a folder" + (f"; did you mean {close}?" if close else ""))
+        found += cells_in(root)
+    places = " ".join(str(source.path) for source in sources)
     tasks_there, algos_there = ({names[i] for names in found} for i in range(2))
     # The folder gives the choices, so that a new task or algorithm needs no entry here.
-    tasks = split_names(f"env in {root}", options.get("env", "all"), order_tasks(tasks_there))
+    tasks = split_names(f"env in {places}", options.get("env", "all"), order_tasks(tasks_there))
     algos = order_algos(algos_there)
     of_paper = {"paper": [algo for algo in algos if algo in COLORS]}
-    algos = split_names(f"algo in {root}", options.get("algo", "all"), algos, of_paper)
-    runs, problems = read_results(root, tasks, algos)
-    runs += [published.run for published in read_published(root, tasks, algos)]
+    algos = split_names(f"algo in {places}", options.get("algo", "all"), algos, of_paper)
+    runs, problems = [], []
+    for source in sources:
+        more, unreadable = read_source(source, tasks, algos)
+        runs += more
+        problems += unreadable
     runs, conflicts = keep_apart(runs)
     groups, repeated = group_runs(runs)
     for problem in problems + repeated:
@@ -106,7 +113,7 @@ def _read(root: Path, options: dict[str, str]) -> Groups:
     for conflict in conflicts:
         print(f"note: {conflict}", file=sys.stderr)
     if not runs:
-        raise ConfigError(f"no readable runs of these tasks and algorithms in {root}")
+        raise ConfigError(f"no readable runs of these tasks and algorithms in {places}")
     return groups
 
 
@@ -167,7 +174,7 @@ def _formats(options: dict[str, str], choices: Sequence[str]) -> list[str]:
 def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     """Words and options. Raises ConfigError for an unknown option, one given twice or without a value."""
     # The path of a run holds a "=" itself, after a "/".
-    words = [argument for argument in arguments if "/" in argument.partition("=")[0] or "=" not in argument]
+    words = [a for a in arguments if "=" not in a or "/" in (path := a.partition("=")[0]) or path.endswith(".csv")]
     return words, parse_words((a for a in arguments if a not in words), ("env", "algo", "paper", "out", "format"))
 
 

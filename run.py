@@ -28,6 +28,7 @@ def usage() -> str:
         "  python run.py algo=SRad env=W+M seed=3             one run",
         "  python run.py algo=SRad env=W+M seed=0-9           ten seeds, trained in lockstep in one process",
         "  python run.py algo=DOpt,DRad env=all seed=0,1      several cells, one after the other",
+        "  python run.py algo=SRad env=R+L2 tau=0.01,0.02     a cell for each value; several lists: all combinations",
         "  python run.py algo=paper env=all seed=0-9 jobs=4   a queue of cells, four at a time, a process each",
         "  python run.py algo=paper env=all seed=0-9 launcher=slurm slurm.hours=12    an array of Slurm jobs",
         "  python run.py status results/                      how all cells stand, running, queued or ended",

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import typing
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, make_dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from algos.definition import changes, define
 from algos.nfwpo import NFWPO
-from algos.policy import Policy, constraint_of, restore, settings_of
+from algos.policy import Policy, parts_of, restore, settings_of
 from algos.sac import SAC
 from algos.td3 import TD3
 from constraints import Constraint
 from core.agent import Agent
 from core.config import Config, PenaltyConfig, keys_of, restore_settings
 from core.maps import Alpha, Gauge, Map, Placement, Project, Radial
-from core.words import NameTable, known_name
+from core.words import ConfigError, NameTable, known_name
+from store.files import one_line
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,9 @@ def saved_config(settings: Mapping[str, Any]) -> Config:
 def load_policy(folder: str | Path, which: str = "best") -> Policy:
     """The policy of the run in `folder`, which is finished or not: observations (n,) or (m, n) -> executed actions.
 
+    Warns, with a UserWarning, if the task or the algorithm is not what it was in the training. The policy is then
+    feasible under the task's present constraint.
+
     `which`: "best" has the parameters of the best evaluation so far, "last" those at the end of the training or, while
     it is unfinished, of its newest checkpoint. Everything is on the CPU.
 
@@ -142,7 +148,13 @@ def load_policy(folder: str | Path, which: str = "best") -> Policy:
     settings = settings_of(folder)
     known_name("algorithm", settings["algo"], ALGORITHMS)
     config = replace(saved_config(settings), device="cpu")
-    constraint, obs_dim = constraint_of(config.env)
-    agent = ALGORITHMS[config.algo].build(config, constraint, obs_dim, config.seeds)
+    constraint, robot, obs_dim = parts_of(config.env)
+    algorithm = ALGORITHMS[config.algo]
+    if changed := changes(folder, define(robot, constraint, algorithm)):
+        warnings.warn(f"{folder} was trained on {changed}", stacklevel=2)
+    try:
+        agent = algorithm.build(config, constraint, obs_dim, config.seeds)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{folder} has a bad configuration: {one_line(error)}") from error
     restore(agent, folder, which)
     return Policy(agent, constraint)

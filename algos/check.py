@@ -154,7 +154,7 @@ class _Check:
     def _check_acting(self, agent: Agent) -> None:
         obs = torch.randn(len(SEEDS), OBS, generator=torch.Generator().manual_seed(0))
         which = [0, 2]
-        before = _stream_states(agent)
+        before, remembered = _stream_states(agent), {name: rows[1].clone() for name, rows in agent.memory().items()}
         agent.start_episode(which)
         agent.start_rollout(which)
         suggested = agent.explore(obs, which)
@@ -166,6 +166,12 @@ class _Check:
                 "a call for the seeds in the positions [0, 2] draws from the stream of position 1; give the streams"
                 " which=which in explore, warm_up, start_rollout and start_episode"
             )
+        for name, row in remembered.items():
+            if not torch.equal(row, agent.memory()[name][1]):
+                self._fail(
+                    f"a call for the seeds in the positions [0, 2] changes memory()[{name!r}] of position 1; explore,"
+                    " start_rollout and start_episode must change the rows `which` alone"
+                )
         before, batch = _stream_states(agent), obs[which].unsqueeze(1).repeat(1, 3, 1)
         policy = agent.policy(which)
         action = policy(batch)

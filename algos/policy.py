@@ -42,18 +42,18 @@ class Policy:
 def settings_of(folder: Path) -> dict[str, Any]:
     """The configuration in the folder of a run; ConfigError where there is none."""
     settings = read_settings(folder)
-    if not {"algo", "env"} <= settings.keys():
+    if not all(isinstance(settings.get(key), str) for key in ("algo", "env")):
         raise ConfigError(
             f"{folder} is not the folder of a run (no readable config.yaml; expected .../<task>/<algorithm>/seed=<n>)"
         )
     return settings
 
 
-def constraint_of(task: str) -> tuple[Constraint, int]:
-    """The constraint of a task and the length of its observations; ConfigError for an unknown task."""
+def parts_of(task: str) -> tuple[Constraint, type, int]:
+    """A task's constraint, the class of its robot and the length of its observations; ConfigError if it is unknown."""
     # The tasks are in a room above this one. Gymnasium imports `envs` where a program has not done so.
     env: Any = gymnasium.make("envs:acrl/Task-v0", task=task, disable_env_checker=True)
-    found = env.unwrapped.constraint, env.observation_space.shape[0]
+    found = env.unwrapped.constraint, type(env.unwrapped.robot), env.observation_space.shape[0]
     env.close()
     return found
 
@@ -83,6 +83,9 @@ def _read_parameters(folder: Path, which: str) -> tuple[dict[str, Tensor], Path]
         ]
         raise ConfigError(f"{folder} has no {which} parameters: {reason}")
     try:
-        return torch.load(path, weights_only=True), path
+        parameters = torch.load(path, weights_only=True)
     except Exception as error:  # PyTorch raises whatever its unpickler and its archive reader do
-        raise ConfigError(f"{path} is damaged: {one_line(error)}") from error
+        raise ConfigError(f"{path} is damaged: {one_line(error) or type(error).__name__}") from error
+    if not isinstance(parameters, dict) or not all(isinstance(value, Tensor) for value in parameters.values()):
+        raise ConfigError(f"{path} is damaged: it has no table of tensors")
+    return parameters, path

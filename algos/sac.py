@@ -139,6 +139,7 @@ class SAC(Agent):
         self.target_entropy = -float(self.action_dim)
         self.rollout_noise = torch.zeros(seeds, *self.actor.noise_shape, device=self.device)
         self.entropy = torch.zeros(seeds, 1, device=self.device)  # of the policy at the last batch's states
+        self.last_losses = {name: torch.zeros(seeds, device=self.device) for name in ("critic_loss", "actor_loss")}
 
     def networks(self) -> dict[str, nn.Module]:
         return {
@@ -156,7 +157,7 @@ class SAC(Agent):
         }
 
     def memory(self) -> dict[str, Tensor]:
-        return {"rollout_noise": self.rollout_noise, "entropy": self.entropy}
+        return {"rollout_noise": self.rollout_noise, "entropy": self.entropy, **self.last_losses}
 
     def start_rollout(self, which: Sequence[int]) -> None:
         """gSDE keeps one theta for a rollout."""
@@ -208,14 +209,17 @@ class SAC(Agent):
             next_value = self.critic_target(batch.next_obs, next_action).amin(0) - alpha * next_log_prob
             q_target = batch.reward + self.config.gamma * (1 - batch.terminated) * next_value
         q = self.critic(batch.obs, batch.action)
-        self.descend("critic", 0.5 * (q - q_target).square().mean(-1))
+        self.descend("critic", losses := 0.5 * (q - q_target).square().mean(-1))
+        self.last_losses["critic_loss"].copy_(losses.detach().mean(0))
 
         value = torch.minimum(*self.critic(batch.obs, action)) - alpha * log_prob
-        self.descend("actor", (self.penalty(batch.obs, suggested) - value).mean(-1))
+        self.descend("actor", loss := (self.penalty(batch.obs, suggested) - value).mean(-1))
+        self.last_losses["actor_loss"].copy_(loss.detach())
         soft_update(self.critic_target, self.critic, self.config.tau)
 
     def statistics(self) -> dict[str, Tensor]:
-        return {"temperature": self.temperature.log_alpha.detach().exp()[:, 0], "entropy": self.entropy[:, 0]}
+        temperature = self.temperature.log_alpha.detach().exp()[:, 0]
+        return {"temperature": temperature, "entropy": self.entropy[:, 0], **self.last_losses}
 
     def draw_noise(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Noise for the samples at s and at s': with gSDE one theta serves both, for the whole batch."""

@@ -29,7 +29,7 @@ class Ball(DiagonalEllipse):
 
     def __init__(self, bound: Bound, dim: int):
         super().__init__(self._ones, bound, dim)
-        self._in_box = None if callable(bound) or bound > 1.0 else _InBox(bound)
+        self._in_box = None if callable(bound) or bound > 1.0 else _InBox(float(bound))
 
     def _ones(self, obs: Tensor) -> Tensor:
         return obs.new_ones(self.dim)

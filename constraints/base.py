@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from constraints.checks import ON_BOUNDARY, check_observation, check_tensor
+from constraints.checks import ON_BOUNDARY, check_observation, check_precision, check_tensor
 from constraints.coefficients import FirstCalls
 from constraints.errors import name_samples, require
 from constraints.gauge import box_gauge_gradient, largest_gauge
@@ -30,6 +30,7 @@ from constraints.ray import Ray
 from constraints.sample import hit_and_run
 
 OnEmpty = Literal["error", "least"]
+
 AT_FACE = 1.0 - 1e-9
 """The box holds a coordinate of a projection that is at least this large: rounding may have moved it off the face."""
 
@@ -246,10 +247,12 @@ class Constraint(ABC):
 
     def radial_log_prob(self, obs: Tensor, action: Tensor, log_prob: Tensor, center: Tensor | None = None) -> Tensor:
         """Log-density (...) of `radial_map(obs, action)`, given the log-density `log_prob` (...) of `action`."""
+        check_tensor("log_prob", log_prob)
         return self.ray(obs, action, center).radial_log_prob(log_prob)
 
     def gauge_log_prob(self, obs: Tensor, action: Tensor, log_prob: Tensor, center: Tensor | None = None) -> Tensor:
         """Log-density (...) of `gauge_map(obs, action)`, given the log-density `log_prob` (...) of `action`."""
+        check_tensor("log_prob", log_prob)
         return self.ray(obs, action, center).gauge_log_prob(log_prob)
 
     def alpha_log_prob(
@@ -260,6 +263,8 @@ class Constraint(ABC):
         With respect to volume where `action` is feasible, to the boundary's surface measure where it is not.
         Source: paper, "alpha-projection with SAC", with the solid angle of dimension d.
         """
+        check_tensor("mean", mean)
+        check_tensor("std", std)
         return self.ray(obs, action, center).alpha_log_prob(mean, std)
 
     def linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
@@ -280,9 +285,11 @@ class Constraint(ABC):
     def sample(self, obs: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
         """Feasible points (..., count, d), uniform in each set A(obs), in the dtype of `obs`.
 
-        Random numbers come from `generator`, or from PyTorch's default one. ValueError for count < 1.
+        Random numbers come from `generator`, or from PyTorch's default one. A set without a closed form takes 4 d
+        (d + 4) steps of two gauges each, which is long from d = 30 on. ValueError for count < 1.
         """
-        if count < 1:
+        refuse_transforms("sample")
+        if operator.index(count) < 1:
             raise ValueError(f"count must be at least 1, got {count}")
         check_observation(obs)
         with torch.no_grad():
@@ -325,8 +332,7 @@ class Constraint(ABC):
         check_tensor("action", action)
         if action.shape[-1:] != (self.dim,):
             raise ValueError(f"expected {self.dim} action coordinates, got shape {tuple(action.shape)}")
-        if not action.is_floating_point():
-            raise TypeError(f"expected float32 or float64 actions, got {action.dtype}")
+        check_precision("actions", action)
         obs, action = obs.double(), action.double()
         if obs.shape[:-1] != action.shape[:-1]:
             try:

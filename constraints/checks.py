@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -11,6 +12,8 @@ from constraints.errors import ConstraintError, name_samples, require
 
 ON_BOUNDARY = 1e-12
 """A centre that is nearer than this to the boundary is on it, up to rounding."""
+_SAME = 1e-4
+"""Values of a function in a batch and alone that differ by no more than this share are the same in float32."""
 # Asymmetry and negative eigenvalues of a matrix up to this share of its largest entry are rounding, in float32 too.
 _ROUNDING = 1e-6
 
@@ -21,11 +24,22 @@ def check_tensor(what: str, value: Any) -> None:
         raise TypeError(f"{what} must be a torch.Tensor, got {type(value).__name__}; torch.as_tensor({what}) makes one")
 
 
+def check_precision(what: str, value: Tensor) -> None:
+    """Raise a TypeError for a tensor that is not float32 or float64. Half precision rounds points out of their set."""
+    if value.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"expected float32 or float64 {what}, got {value.dtype}")
+
+
 def check_observation(obs: Any) -> None:
-    """Raise a TypeError for what is not a tensor of floating-point numbers. Results get the dtype of `obs`."""
+    """Raise a TypeError for what is not a tensor of float32 or float64. Results get the dtype of `obs`."""
     check_tensor("obs", obs)
-    if not obs.is_floating_point():
-        raise TypeError(f"expected float32 or float64 observations, got {obs.dtype}")
+    check_precision("observations", obs)
+
+
+def check_function(what: str, value: Any) -> None:
+    """Raise a TypeError for what is not a function."""
+    if not callable(value):
+        raise TypeError(f"{what} must be a function of the observation, got {type(value).__name__}")
 
 
 def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tensor, finite: bool = True) -> Tensor:
@@ -53,6 +67,31 @@ def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tens
     valid = values.isfinite().flatten(len(lead)).all(-1) if shape else values.isfinite()
     require(valid.flatten(), f"{what} is NaN or infinite", name_samples(tuple(lead)))
     return values
+
+
+@torch.no_grad()
+def check_each_alone(function: Callable[[Tensor], Any], values: Tensor, what: str, axes: int, obs: Tensor) -> None:
+    """Raise a ConstraintError if `values`, those of `function` at the batch obs, are others where one stands alone.
+
+    A function of a single observation may pass as one of a batch: rows (d,) of n observations look like n rows of each.
+    `axes` is the number of the values' own axes.
+    """
+    lead = obs.shape[:-1]
+    one = obs[(slice(-1, None),) * len(lead)]
+    try:
+        alone = checked(function(one), what, (-1,) * axes, one, finite=False)
+    except (ValueError, RuntimeError, IndexError):
+        return  # it has the coefficients of one batch, whatever the observation
+
+    def last_of(values: Tensor, lead: torch.Size) -> Tensor:
+        return values.expand(*lead, *values.shape[values.dim() - axes :])[(-1,) * len(lead)]
+
+    last, single = last_of(values, lead), last_of(alone, one.shape[:-1])
+    if last.shape != single.shape or not torch.allclose(last, single, _SAME, _SAME * float(last.abs().sum())):
+        raise ConstraintError(
+            f"{what} of an observation depends on the others in its batch: it has shape {tuple(values.shape)} at"
+            f" observations {tuple(obs.shape)} and {tuple(alone.shape)} at one of them; it must take each alone"
+        )
 
 
 def check_semidefinite(matrix: Tensor, what: str) -> Tensor:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from constraints.checks import check_tensor, checked
+from constraints.checks import check_each_alone, check_function, check_tensor, checked
 from constraints.errors import ConstraintError, check_bound, name_samples, require
 from constraints.numerics import is_transformed
 
@@ -69,10 +69,9 @@ class Coefficient:
         shape: tuple[int, ...],
         check: Callable[[Tensor, str], object] | None = None,
     ):
-        if not callable(function):
-            raise TypeError(f"{what} must be a function of the observation, got {type(function).__name__}")
+        check_function(what, function)
         self._what, self._function, self._shape, self._check = f"{what}(obs)", function, shape, check
-        self._calls = FirstCalls()
+        self._calls, self._compared = FirstCalls(), False
 
     def __call__(self, obs: Tensor) -> Tensor:
         """The values (..., *shape), float64, at obs (..., n)."""
@@ -89,6 +88,9 @@ class Coefficient:
         values = checked(values, self._what, self._shape, obs, finite=look)
         if look and self._check is not None:
             self._check(values, self._what)
+        if look and not self._compared and obs.shape[:-1].numel() > 1:
+            self._compared = True
+            check_each_alone(self._function, values, self._what, len(self._shape), obs)
         return values
 
 

@@ -37,6 +37,14 @@ def is_transformed() -> bool:
     return torch._C._are_functorch_transforms_active()
 
 
+def is_mapped() -> bool:
+    """Whether torch.func.vmap is at work, so that values of tensors cannot be looked at."""
+    if not is_transformed():
+        return False
+    functorch = torch._C._functorch
+    return any(level.key() == functorch.TransformType.Vmap for level in functorch.get_interpreter_stack() or ())
+
+
 def refuse_transforms(what: str) -> None:
     """Raise a RuntimeError where a transform of torch.func is at work."""
     if is_transformed():

@@ -187,7 +187,7 @@ class Agent(Snapshots):
             raw[warming_up] = self.warm_up(warming_up)[warming_up].cpu()
         if exploring:
             raw[exploring] = self.explore(obs.to(self.device), exploring)[exploring].cpu()
-        suggested = raw.clamp(-1.0, 1.0) if self.map.squashes else raw
+        suggested = self.bounded(raw)
         if exploring:
             executed = self.feasible(obs, suggested, center)
         if warming_up:
@@ -209,6 +209,10 @@ class Agent(Snapshots):
     def squash(self, raw: Tensor) -> Tensor:
         """The suggestion in the output of an actor's network."""
         return raw.tanh() if self.map.squashes else raw
+
+    def bounded(self, raw: Tensor) -> Tensor:
+        """What the map is given of the suggestions `raw`: the box's closest point where the map squashes."""
+        return raw.clamp(-1.0, 1.0) if self.map.squashes else raw
 
     def warm_up(self, which: Sequence[int]) -> Tensor:
         """Random suggestions (seeds, d), uniform in the box, for the seeds `which`."""

@@ -70,7 +70,9 @@ class Ahead:
     def __init__(self, generators: Sequence[torch.Generator], kinds: Sequence[Sequence[Draw]], device: torch.device):
         self.generators, self.kinds = generators, kinds
         self.pinned = device.type == "cuda"
-        self.words = any(draw.kind == "words" for draws in kinds for draw in draws)
+        words = {draw.kind == "words" for draws in kinds for draw in draws}
+        assert len(words) == 1, "a stream has only words, or none: a block holds numbers of one dtype"
+        self.words = words == {True}
         width = max(sum(draw.size for draw in draws) for draws in kinds)
         self.block = torch.zeros(len(generators), BLOCK, width, dtype=self._dtype, device=device)
         self.row = torch.zeros(1, dtype=torch.int64, device=device)  # of the block, that the next step reads

@@ -17,12 +17,14 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from core.words import ConfigError
+from store.loggers import CSV, LOGGERS
 
 CORES = torch.get_num_threads()
 """All physical cores, or OMP_NUM_THREADS."""
 THREADS = {"cpu": min(CORES, 4), "cuda": min(CORES, 8)}
 """What threads=auto is for a cell that is alone on the machine. Its networks are small and fill no more than 4; beside
 a GPU the threads move MuJoCo's robots."""
+MOST_THREADS = 1024
 AUTO = "auto"
 """Stands for the fastest choice on the machine that trains."""
 
@@ -119,9 +121,21 @@ class Config:
     threads: int | str = setting(
         AUTO,
         "CPU threads; auto: a cell alone up to 4 (beside a GPU 8), in a sweep 1",
-        Rule(lambda value: value == AUTO or (isinstance(value, int) and value >= 1), "must be auto or at least 1"),
+        # (PyTorch crashes with a million)
+        Rule(
+            lambda value: value == AUTO or (isinstance(value, int) and 1 <= value <= MOST_THREADS),
+            f"must be auto or from 1 to {MOST_THREADS}",
+        ),
     )
     checkpoint_every: int = setting(10_000, "environment steps of a seed between checkpoints", AT_LEAST_ONE)
+    log: str = setting(
+        CSV,
+        "where numbers go: csv (the run's files, always), tensorboard, wandb, or several, as tensorboard,wandb",
+        Rule(
+            lambda value: set(value.split(",")) <= {CSV, *LOGGERS},
+            f"must list some of {', '.join((CSV, *LOGGERS))}, with commas between them",
+        ),
+    )
 
 
 @dataclass
@@ -131,7 +145,7 @@ class PenaltyConfig(Config):
     penalty: float = setting(1.0, "names with +: weight of the penalty", NOT_NEGATIVE)
 
 
-RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "simulator", "device", "threads", "checkpoint_every")
+RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "simulator", "device", "threads", "checkpoint_every", "log")
 """Settings that do not make a run another experiment: they never show in a run's name."""
 
 
@@ -157,6 +171,28 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             raise ConfigError(f"bad seed {text!r}: at most 1000 seeds a range, each below 2^31")
         seeds.update(range(low, high + 1))
     return tuple(sorted(seeds))
+
+
+def split_values(schema: type, key: str, text: str) -> list[str]:
+    """The values of one key of the dataclass `schema` in a comma list: `1e-3,3e-4`, or `[64,64],[128,128]` of lists.
+
+    A list without brackets is one value, and so is any value of `RUN_KEYS`. Raises ConfigError for an empty value, and
+    for brackets that do not hold all of the values.
+    """
+    kind = typing.get_type_hints(schema)[keys_of(schema)[key].name]
+    if key in RUN_KEYS:
+        return [text]
+    if typing.get_origin(kind) is not list:
+        values = text.split(",")
+    elif "[" not in text and "]" not in text:
+        return [text]
+    elif re.fullmatch(r"\[[^][]*\](,\[[^][]*\])*", text):
+        values = re.findall(r"\[[^][]*\]", text)
+    else:
+        raise ConfigError(f"bad value {text!r} for {key}: expected one list, as 64,64, or several, as [64,64],[128]")
+    if not all(values):
+        raise ConfigError(f"bad value {text!r} for {key}: a value between commas is empty")
+    return list(dict.fromkeys(values))
 
 
 def parse_value(schema: type, key: str, text: str, prefix: str = "") -> Any:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
 from torch import Tensor
 
 from core.config import Config
+from core.suggestions import EVERY, Suggestions
 from store.checkpoint import CheckpointFolder
 from store.folder import RunWriter, has_failed, is_finished
 
@@ -38,6 +39,7 @@ class Seed:
     owed: int = 0  # gradient steps that it must take before it goes on collecting
     gradient_steps: int = 0
     evaluated: int = 0  # the step of its last evaluation
+    suggestions: Suggestions = field(default_factory=Suggestions)  # since then
     best: Best | None = None
     result: dict[str, Any] | None = None  # of a seed that has finished
     failure: dict[str, Any] | None = None  # of one that has diverged
@@ -55,6 +57,11 @@ class Seed:
         """Whether it has diverged, and the best parameters before that have not had their final evaluation yet."""
         has_best = self.best is not None and math.isfinite(self.best.mean)
         return self.failure is not None and "result" not in self.failure and has_best
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether its next suggestion is one of those that `suggestions` counts."""
+        return self.steps % EVERY == 0
 
     def count_step(self, config: Config, episode_over: bool) -> bool:
         """Count an environment step. Return True if a rollout ends here and no gradient steps follow it."""
@@ -89,6 +96,7 @@ class Seed:
         """Its part of a checkpoint."""
         return {
             "counters": {name: getattr(self, name) for name in COUNTERS},
+            "suggestions": asdict(self.suggestions),
             "best": self.best and tuple(self.best),
             "result": self.result,
             "failure": self.failure,
@@ -100,6 +108,7 @@ class Seed:
         """Go back to what `state` returned."""
         for name in COUNTERS:
             setattr(self, name, state["counters"][name])
+        self.suggestions = Suggestions(**state["suggestions"])
         self.result, self.failure = state["result"], state["failure"]
         self.env.unwrapped.set_state(state["environment"])
         self.writer.restore_tables(state["tables"])

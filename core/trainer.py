@@ -101,6 +101,7 @@ class Trainer:
             self.evaluator.close()
             for seed in self.seeds:
                 seed.env.close()
+                seed.writer.loggers.close()
         for seed in self.seeds:
             seed.checkpoints.remove()
         return [seed.result for seed in self.seeds]
@@ -195,6 +196,10 @@ class Trainer:
             warming_up = [seed.position for seed in seeds if seed.steps < starts]
             exploring = [seed.position for seed in seeds if seed.steps >= starts]
             action = self.agent.act(self.obs, self.center, warming_up, exploring)
+            if measured := [seed for seed in seeds if seed.position in exploring and seed.is_measured]:
+                violations = self.agent.constraint.violation(self.obs, self.agent.bounded(action.suggested)).tolist()
+                for seed in measured:
+                    seed.suggestions.add(violations[seed.position])
             self._fail_refused()
         arrived, reset_obs = self.obs.numpy().copy(), {}
         reward, terminated, ended = (np.zeros((len(self.seeds), 1), dtype=np.float32) for _ in range(3))
@@ -273,8 +278,8 @@ class Trainer:
                 continue
             seed.evaluated = seed.steps
             seed.writer.append_evaluation(seed.steps, seed_returns, self.timer.seconds["total"])
-            if statistics and seed.gradient_steps:
-                measures = {name: float(values[i]) for name, values in statistics.items()}
+            measures = {name: float(values[i]) for name, values in statistics.items()} | seed.suggestions.take()
+            if seed.gradient_steps:
                 seed.writer.append_statistics(seed.steps, measures)
             mean = float(seed_returns.mean())
             if seed.is_best(mean):

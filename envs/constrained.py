@@ -12,7 +12,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from torch import Tensor
 
 from constraints import Constraint
 from core.words import known_name
@@ -20,8 +19,7 @@ from envs.drawing import draw_set
 from envs.registry import TASKS, Task
 from envs.robot import Robot, Step, UnavailableError
 
-TOLERANCE = 1e-6
-"""Largest violation that an executed action may have, in the units of `Constraint.violation`."""
+TOLERANCE = 1e-6  # largest violation an executed action may have, in the units of `Constraint.violation`
 
 Outcome = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
 """What `step` of an environment returns: observation (n,), reward, terminated, truncated, info."""
@@ -31,14 +29,11 @@ class InfeasibleActionError(ValueError):
     """An action lies outside the task's feasible set at the current observation, or is no action at all."""
 
 
-def allowed_violation(constraint: Constraint, obs: Tensor) -> Tensor:
-    """The largest violations (...) that actions executed at obs (..., n) may have.
-
-    It is TOLERANCE and, for a constraint with `on_empty="least"`, the least violation that is possible there.
-    """
-    if constraint.on_empty != "least":
-        return obs.new_full(obs.shape[:-1], TOLERANCE)
-    return TOLERANCE + constraint.least_violation(obs)
+def allowed_violation(constraint: Constraint, obs: torch.Tensor, violation: float) -> torch.Tensor:
+    """The largest violations (...) that executed actions may have at obs (..., n), where the largest is `violation`."""
+    if violation > TOLERANCE and constraint.on_empty == "least":
+        return TOLERANCE + constraint.least_violation(obs).double()
+    return torch.full(obs.shape[:-1], TOLERANCE, dtype=torch.float64, device=obs.device)
 
 
 def find_task(name: str) -> Task:
@@ -99,8 +94,7 @@ def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.nda
 
 
 def _all_well_formed(envs: Sequence[ActionConstrainedEnv], actions: Any) -> bool:
-    """Whether each action is well-formed and each environment ready, in one check of all. False may also mean that the
-    check cannot tell."""
+    """Whether each action is well-formed and each environment ready, asked of all at once. It may say no wrongly."""
     if not envs or not isinstance(actions, np.ndarray) or actions.shape != (len(envs), envs[0].constraint.dim):
         return False
     return all(env._obs is not None for env in envs) and bool(np.isfinite(actions).all())
@@ -320,9 +314,7 @@ class ActionConstrainedEnv(gymnasium.Env):
             obs, exact = torch.from_numpy(self._obs), torch.from_numpy(action.astype(np.float64))
             exact = self.constraint.project(obs, exact)
             action, violation = exact.numpy(), self.constraint.violation(obs, exact).item()
-        allowed = TOLERANCE
-        if violation > TOLERANCE:
-            allowed = allowed_violation(self.constraint, torch.from_numpy(self._obs)).item()
+        allowed = allowed_violation(self.constraint, torch.from_numpy(self._obs), violation).item()
         if not violation <= allowed:  # a NaN is refused as well
             return InfeasibleActionError(
                 f"{self._where()}: action {action} violates the constraint by {violation:.3g} "

@@ -10,7 +10,6 @@ from typing import Any, cast
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 
 from envs.locomotion import silent_mujoco
 from envs.robot import Robot, Step
@@ -21,8 +20,6 @@ class _Wrapped(Robot):
 
     identifier: str
     """Of the environment, for `gymnasium.make`."""
-    spec: EnvSpec
-    """What Gymnasium makes the environment of."""
     render_mode: str | None
     """"rgb_array", or None for an environment without pictures."""
 
@@ -114,7 +111,6 @@ def GymnasiumRobot(identifier: str) -> type[Robot]:  # noqa: N802
             raise ValueError(f"{identifier} has no time limit (max_episode_steps), which a robot needs")
         attributes = {
             "identifier": identifier,
-            "spec": env.spec,
             "obs_dim": int(np.prod(observations.shape)),
             "action_dim": int(np.prod(actions.shape)),
             "max_episode_steps": env.spec.max_episode_steps,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from constraints import Constraint
 from core.words import known_name
-from envs.constrained import TOLERANCE, InfeasibleActionError, allowed_violation
+from envs.constrained import InfeasibleActionError, allowed_violation
 
 MAPPINGS: dict[str, Callable[[Constraint, Tensor, Tensor], Tensor]] = {
     "project": lambda constraint, obs, action: constraint.project(obs, action),
@@ -55,7 +55,7 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     (d,), for a constraint of another dimension, and for observations that need `features`. `step` raises
     InfeasibleActionError, a ValueError too, for an action of another shape and for one that is not finite; also if a
     mapped action violates the constraint by more than 1e-6, which shows that the constraint or the observation is
-    wrong. Where a set with `on_empty="least"` is empty, the least possible violation is allowed as well.
+    wrong.
     """
 
     def __init__(
@@ -69,6 +69,8 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             self, _disable_deepcopy=True, constraint=constraint, mapping=mapping, features=features
         )
         super().__init__(env)
+        if not isinstance(constraint, Constraint):
+            raise TypeError(f"the constraint is an object of a constraints.Constraint, got {constraint!r}")
         if mapping is not None:
             known_name("mapping", mapping, MAPPINGS)
         if features is None:
@@ -111,30 +113,25 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         action = torch.from_numpy(suggested)
         violation = self._violation(action)
         if self.mapping is None:
-            if refused := self._refusal(violation):
-                raise InfeasibleActionError(f"action {suggested} {refused}")
+            if not violation <= (allowed := self._allowed(violation)):
+                raise InfeasibleActionError(f"action {suggested} {_excess(violation, allowed)}")
             return suggested.copy(), violation
         if self.mapping in KEEP_FEASIBLE and violation <= 0.0:
             return suggested.copy(), violation
         mapped = MAPPINGS[self.mapping](self.constraint, self._obs, action)
-        if refused := self._refusal(self._violation(mapped)):
+        left = self._violation(mapped)
+        if not left <= (allowed := self._allowed(left)):  # a NaN is refused as well
             raise InfeasibleActionError(
-                f"{self.mapping} maps {suggested} to {mapped.numpy()}, which {refused}; the constraint does not"
-                f" work at the observation {self._obs.numpy()}"
+                f"{self.mapping} maps {suggested} to {mapped.numpy()}, which {_excess(left, allowed)}; the constraint"
+                f" does not work at the observation {self._obs.numpy()}"
             )
         return mapped.numpy(), violation
 
     def _violation(self, action: Tensor) -> float:
         return self.constraint.violation(self._obs, action).item()
 
-    def _refusal(self, violation: float) -> str | None:
-        """Why an action with this violation is refused; None where it is not."""
-        allowed = TOLERANCE
-        if violation > TOLERANCE:
-            allowed = allowed_violation(self.constraint, self._obs).item()
-        if violation <= allowed:  # not of a NaN
-            return None
-        return f"violates the constraint by {violation:.3g} (at most {allowed:.3g} is allowed)"
+    def _allowed(self, violation: float) -> float:
+        return allowed_violation(self.constraint, self._obs, violation).item()
 
     def _see(self, obs: Any) -> None:
         """Keep a copy of what the constraint sees of an observation: environments may write into theirs."""
@@ -142,6 +139,10 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         if seen.ndim != 1:
             raise ValueError(f"features() must return an array (n,), got shape {seen.shape}")
         self._obs = torch.from_numpy(seen)
+
+
+def _excess(violation: float, allowed: float) -> str:
+    return f"violates the constraint by {violation:.3g} (at most {allowed:g} is allowed)"
 
 
 def _checked_box(space: gymnasium.Space, dim: int) -> gymnasium.spaces.Box:

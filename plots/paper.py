@@ -56,10 +56,27 @@ def order_tasks(names: Iterable[str]) -> list[str]:
 
 
 def order_algos(names: Iterable[str]) -> list[str]:
+    """The algorithms in the paper's order, other ones last; those with a label follow the one without."""
     return _order(names, COLORS)
 
 
 def _order(names: Iterable[str], known: Iterable[str]) -> list[str]:
-    names = set(names)
-    known = [name for name in known if name in names]
-    return known + sorted(names.difference(known))
+    place = {name: i for i, name in enumerate(known)}
+    return sorted(set(names), key=lambda name: (place.get(unlabelled(name), len(place)), name))
+
+
+def labelled(algo: str, label: str) -> str:
+    """The name of `algo` in the results of another place, which has a label (plots/others.py)."""
+    return f"{algo} ({label})" if label else algo
+
+
+def unlabelled(algo: str) -> str:
+    """The name of an algorithm without its label."""
+    return algo.partition(" (")[0]
+
+
+def same_without_constraint(algo: str) -> str | None:
+    """The algorithm that trains for `algo` on R+N in the same results; None where that is `algo` itself."""
+    name = unlabelled(algo)
+    same = SAME_WITHOUT_CONSTRAINT.get(name)
+    return same and same + algo.removeprefix(name)

@@ -5,12 +5,13 @@ It reads docs/data and replaces both tables. A test compares them with the data.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from plots.grouping import group_runs, statistic
+from plots.grouping import DAGGER, count_diverged, final_return, group_runs, statistic
 from plots.paper import DEFAULT_BATCH, Statistic, order_algos, order_tasks, read_paper
 from plots.rewards import decimals
 from plots.starts import adjusted_returns, is_on_reacher
@@ -27,12 +28,13 @@ Cells = dict[str, dict[str, list[Run]]]
 
 
 def read_cells(root: str | Path) -> Cells:
-    """The finished runs published in `root` that have the paper's own settings.
+    """The runs published in `root` that have the paper's own settings and a final result.
 
+    A run that diverged has that of the best parameters before.
     Raises ValueError if a file is corrupt, a run repeats another, or a cell mixes settings.
     """
     runs = [published.run for published in read_published(root)]
-    groups, repeated = group_runs(run for run in runs if not run.overrides and run.finished)
+    groups, repeated = group_runs(run for run in runs if not run.overrides and _has_result(run))
     mixed = [f"{condition.label}: settings differ within a cell" for condition in groups if condition.settings]
     if repeated or mixed:
         raise ValueError("; ".join(repeated + mixed))
@@ -49,7 +51,7 @@ def overview(cells: Cells) -> str:
             if runs := cells[task].get(algo):
                 ours, theirs = _results(runs), read_paper().get((task, DEFAULT_BATCH, algo))
                 digits = decimals(stat.mean for stat in (ours, theirs) if stat)
-                row.append(f"**{_text(ours, digits)}** (n={ours.n}) / {_text(theirs, digits)}")
+                row.append(f"**{_text(ours, digits)}**{_mark(runs)} (n={ours.n}) / {_text(theirs, digits)}")
             else:
                 row.append(MISSING)
         rows.append(row)
@@ -59,8 +61,8 @@ def overview(cells: Cells) -> str:
 def details(cells: Cells) -> str:
     """The table of docs/results.md: a row a cell, with the results on Reacher adjusted for their starts."""
     rows = [
-        ["task", "algorithm", "seeds", "final result", "adjusted for the starts", "paper"],
-        ["---"] * 3 + ["---:"] * 3,
+        ["task", "algorithm", "seeds", "final result", "adjusted for the starts", "paper", "largest violation"],
+        ["---"] * 3 + ["---:"] * 4,
     ]
     for task in order_tasks(cells):
         for algo in order_algos(cells[task]):
@@ -68,15 +70,27 @@ def details(cells: Cells) -> str:
             ours, theirs = _results(runs), read_paper().get((task, DEFAULT_BATCH, algo))
             digits = decimals(stat.mean for stat in (ours, theirs) if stat)
             adjusted = None
-            if is_on_reacher(runs[0]):
+            if is_on_reacher(runs[0]) and not _mark(runs):  # the starts of a run that diverged are not known
                 adjusted = statistic([float(np.mean(adjusted_returns(run))) for run in runs])
-            seeds = ", ".join(str(run.seed) for run in runs)
-            rows.append([task, algo, seeds, *(_text(stat, digits) for stat in (ours, adjusted, theirs))])
+            seeds = ", ".join(f"{run.seed}{_mark([run])}" for run in runs)
+            result = _text(ours, digits) + _mark(runs)
+            violation = f"{max((run.result or run.failure)['largest_violation'] for run in runs):.1e}"
+            rows.append([task, algo, seeds, result, _text(adjusted, digits), _text(theirs, digits), violation])
     return _markdown(rows)
 
 
+def _has_result(run: Run) -> bool:
+    value = final_return(run)
+    return value is not None and math.isfinite(value)
+
+
 def _results(runs: Sequence[Run]) -> Statistic:
-    return statistic([float(run.result["return_mean"]) for run in runs])
+    return statistic([final_return(run) for run in runs])
+
+
+def _mark(runs: Sequence[Run]) -> str:
+    """A dagger where seeds diverged."""
+    return DAGGER * bool(count_diverged(runs))
 
 
 def _text(stat: Statistic | None, digits: int) -> str:

@@ -24,6 +24,8 @@ from plots.paper import (
     Statistic,
     order_algos,
     read_paper,
+    same_without_constraint,
+    unlabelled,
 )
 from store.folder import Run
 from tables import MISSING, Table, TableCell, text_cells
@@ -60,7 +62,7 @@ def reward_table(groups: Groups, beside: bool = False) -> Table:
             best = best_three({algo: stat.mean for algo, stat in row.items()})
             cells = [TableCell(tuple(condition.label.split(", ")))]
             for algo in algos:
-                same = SAME_WITHOUT_CONSTRAINT.get(algo) if condition.task == UNCONSTRAINED else None
+                same = same_without_constraint(algo) if condition.task == UNCONSTRAINED else None
                 if algo in row:
                     runs = groups[condition][algo]
                     cells.append(TableCell(_our_lines(row[algo], digits, runs), algo in best))
@@ -84,7 +86,7 @@ def reward_table(groups: Groups, beside: bool = False) -> Table:
         own = [algo] if algo in ours or not beside else []
         header += [*own, *([f"{algo} (paper)"] if algo in printed else [])]
     for name, family in FAMILIES.items():
-        if count := sum(head.removesuffix(" (paper)") in family for head in header):
+        if count := sum(unlabelled(head) in family for head in header):
             spans[name] = count
     return Table("rewards", title, header, 1, sections, records, spans)
 
@@ -125,7 +127,10 @@ def comparison_table(groups: Groups) -> Table:
         rows = []
         for condition in conditions:
             for algo in order_algos(statistics[condition]):
-                ours, theirs = statistics[condition][algo], paper.get((condition.task, _batch(condition), algo))
+                ours, theirs = (
+                    statistics[condition][algo],
+                    paper.get((condition.task, _batch(condition), unlabelled(algo))),
+                )
                 digits = decimals((ours.mean, theirs.mean if theirs else ours.mean))
                 texts = [condition.label, algo, " ".join(_our_lines(ours, digits, groups[condition][algo]))]
                 record = condition._asdict() | {"algo": algo} | ours._asdict()

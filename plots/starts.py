@@ -17,11 +17,11 @@ from scipy.stats import qmc
 from core.random import stream_seed
 from envs import TASKS, make
 from envs.reacher import REACH, Reacher
-from plots.grouping import Groups, order_conditions, statistic
+from plots.grouping import Groups, count_diverged, order_conditions, statistic
 from plots.paper import order_algos
 from plots.rewards import describe
 from store.folder import Run
-from tables import Table, text_cells
+from tables import MISSING, Table, text_cells
 
 POINTS = 2**14
 """Starts that the mean gain is the mean of. They are spread evenly (Sobol), and its error is some 0.001."""
@@ -81,14 +81,22 @@ def is_on_reacher(run: Run) -> bool:
 
 
 def adjusted_table(groups: Groups) -> Table:
-    """Plain and adjusted returns of the cells on Reacher, over seeds, and how far a seed's 50 episodes scatter."""
+    """Plain and adjusted returns of the cells on Reacher, over seeds, and how far a seed's 50 episodes scatter.
+
+    Seeds that diverged are left out, as their starts are not known; a note says how many.
+    """
     sections, records = [], []
     for conditions in order_conditions(groups):
         rows = []
         for condition in conditions:
             for algo in order_algos(groups[condition]):
-                runs = [run for run in groups[condition][algo] if run.result and is_on_reacher(run)]
+                on_reacher = [run for run in groups[condition][algo] if is_on_reacher(run)]
+                diverged = count_diverged(on_reacher)
+                note = f" ({diverged} of {len(on_reacher)} diverged, left out)" if diverged else ""
+                runs = [run for run in on_reacher if "returns" in (run.result or {})]
                 if not runs:
+                    if diverged:
+                        rows.append(text_cells(condition.label, algo, f"{MISSING}{note}", *[MISSING] * 3))
                     continue
                 plain = [np.array(run.result["returns"]) for run in runs]
                 adjusted = [adjusted_returns(run) for run in runs]
@@ -97,10 +105,12 @@ def adjusted_table(groups: Groups) -> Table:
                     np.mean([statistic(values.tolist()).se for values in returns]) for returns in (plain, adjusted)
                 ]
                 cells = [" ".join(describe(stat, 2)) for stat in over_seeds] + [f"{error:.2f}" for error in of_a_seed]
+                cells[0] += note
                 rows.append(text_cells(condition.label, algo, *cells))
                 names = ("mean", "se", "n", "adjusted_mean", "adjusted_se", "seed_se", "adjusted_seed_se")
                 values = (*over_seeds[0], *over_seeds[1][:2], *of_a_seed)
-                records.append(condition._asdict() | {"algo": algo} | dict(zip(names, values, strict=True)))
+                record = condition._asdict() | {"algo": algo} | dict(zip(names, values, strict=True))
+                records.append(record | {"diverged": diverged})
         if rows:
             sections.append(rows)
     title = "Reacher: returns as they are, and adjusted for the luck of their starts"

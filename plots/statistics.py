@@ -18,11 +18,11 @@ from scipy import stats
 from plots.grouping import Groups, final_return
 from plots.paper import (
     DEFAULT_BATCH,
-    SAME_WITHOUT_CONSTRAINT,
     UNCONSTRAINED,
     order_algos,
     order_tasks,
     read_paper,
+    same_without_constraint,
 )
 
 RESAMPLES = 2_000
@@ -58,8 +58,8 @@ def normalised_scores(groups: Groups) -> dict[str, Scores]:
                 values = np.asarray(returns) / unit
                 by_settings[condition.settings][algo][condition.task] = np.where(np.isfinite(values), values, -np.inf)
     for scores in by_settings.values():
-        for algo, same in SAME_WITHOUT_CONSTRAINT.items():
-            if algo in scores and UNCONSTRAINED in scores.get(same, {}):
+        for algo in scores:
+            if UNCONSTRAINED in scores.get(same := same_without_constraint(algo), {}):
                 scores[algo].setdefault(UNCONSTRAINED, scores[same][UNCONSTRAINED])
     return {
         settings: {

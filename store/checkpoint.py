@@ -31,7 +31,7 @@ from store.files import one_line, replace_file
 Stretch = Callable[[int, int], Sequence[torch.Tensor]]
 """Maps `start` and `stop` to views of one seed's transitions `start` to `stop` - 1, a row of float32 each."""
 
-FORMAT = 3
+FORMAT = 4
 """Counts the changes of what a checkpoint holds."""
 
 _DAMAGES = (OSError, ValueError, KeyError, TypeError, RuntimeError, pickle.UnpicklingError)

@@ -8,25 +8,25 @@ info.json stands for their code. `differences` says what has changed between two
 
 from __future__ import annotations
 
-import ast
+import contextlib
 import functools
 import hashlib
+import importlib
 import inspect
-import io
-import linecache
+import logging
 import re
 import sys
-import textwrap
-import tokenize
 import types
-from collections.abc import Iterable, Iterator, Mapping
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import Enum
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
-from store.origin import is_project, is_user, module_of, user_file
+from store.origin import is_project, is_user, is_user_module, module_of
+from store.source import imports_in, names_in, source_of, without_source
 
 Description = dict[str, str]
 
@@ -37,9 +37,20 @@ _SHOWN = 3
 _PRINTED = 16
 """The most numbers of an array that are written out; of larger ones, the checksum is."""
 _WIDTH = 70
-_PLAIN = (type(None), bool, int, float, complex, str, bytes, Enum, PurePath, re.Pattern, range)
-_FUNCTIONS = (types.FunctionType, types.MethodType, functools.partial, types.BuiltinFunctionType, staticmethod)
-_FUNCTIONS += (classmethod, property)  # type: ignore[assignment]
+_PLAIN = (type(None), type(...), bool, int, float, complex, str, bytes, range, slice, PurePath, re.Pattern)
+_SEQUENCES = (list, tuple, deque)
+_SETS = (set, frozenset)
+_WRAPPERS: dict[type, tuple[str, ...]] = {
+    functools.partial: ("func", "args", "keywords"),
+    functools.partialmethod: ("func", "args", "keywords"),
+    functools.cached_property: ("func",),
+    property: ("fget", "fset", "fdel"),
+    staticmethod: ("__func__",),
+    classmethod: ("__func__",),
+}
+"""What is behind a function, for things that hold one."""
+_RANDOM = ("Generator", "BitGenerator", "RandomState", "Random", "SeedSequence")
+"""Classes of random generators, whose states are another in every process."""
 
 
 def describe(parts: Mapping[str, Any]) -> Description:
@@ -51,7 +62,7 @@ def describe(parts: Mapping[str, Any]) -> Description:
 
 
 def is_own(description: Mapping[str, str]) -> bool:
-    """Whether the description has no code of the user."""
+    """Whether nothing described is the user's code."""
     return _USER not in description
 
 
@@ -101,25 +112,33 @@ class _Describer:
     def __init__(self) -> None:
         self.found: Description = {}
         self.paths: dict[int, str] = {}
+        self.classes: set[type] = set()
         self.kept: list[Any] = []  # alive, so that no other object gets their identity
 
     def add(self, path: str, value: Any) -> None:
-        if isinstance(value, _PLAIN) and not isinstance(value, np.generic):
+        path = self._free(path)
+        if isinstance(value, Enum):
+            self.found[path] = f"{type(value).__name__}.{value.name}"
+            self.add(f"{path}.value", value.value)
+        elif _is_plain(value):
             self.found[path] = _plain(value)
         elif isinstance(value, Mapping):
             self.found[path] = type(value).__name__
             for key, item in value.items():
                 self.add(f"{path}[{_plain(key)}]", item)
-        elif isinstance(value, (set, frozenset)):
-            self.found[path] = f"{type(value).__name__} {sorted(map(_plain, value))}"
-        elif isinstance(value, (list, tuple)) and all(isinstance(item, _PLAIN) for item in value):
+        elif isinstance(value, _SETS):
+            self.found[path] = f"{type(value).__name__} {_plain(value)}"
+        elif isinstance(value, _SEQUENCES) and all(map(_is_plain, value)):
             self.found[path] = ", ".join(map(_plain, value))
-        elif isinstance(value, (list, tuple)):
+        elif isinstance(value, _SEQUENCES):
             self.found[path] = f"{len(value)} of them"
             for i, item in enumerate(value):
                 self.add(f"{path}[{i}]", item)
         elif (array := _as_array(value)) is not None:
-            self.found[path] = _array(array)
+            if array.dtype.hasobject:
+                self.add(path, array.tolist())
+            else:
+                self.found[path] = _array(array)
         elif isinstance(value, types.ModuleType):
             self.found[path] = value.__name__
         elif id(value) in self.paths:
@@ -129,141 +148,188 @@ class _Describer:
             self.kept.append(value)
             self._object(path, value)
 
+    def _free(self, path: str) -> str:
+        """`path`, or where two things have it, as two keys of a dictionary with the same text, a longer one."""
+        while path in self.found:
+            path += "'"
+        return path
+
     def _object(self, path: str, value: Any) -> None:
         if isinstance(value, type):
             self.found[path] = value.__qualname__
             self._class(value)
-        elif isinstance(value, np.ufunc):
-            self.found[path] = value.__name__
-        elif isinstance(value, functools.partial):
-            self.found[path] = "partial"
-            self.add(f"{path}.func", value.func)
-            self.add(f"{path}.args", value.args)
-            self.add(f"{path}.keywords", value.keywords)
+        elif isinstance(value, types.FunctionType):
+            self._function(path, value)
         elif isinstance(value, types.MethodType):
             self.found[path] = f"method {value.__func__.__qualname__}"
             self.add(f"{path}.self", value.__self__)
             if not is_project(module_of(value.__func__)):
                 self.add(f"{path}.function", value.__func__)
-        elif isinstance(function := inspect.unwrap(value) if callable(value) else None, types.FunctionType):
-            self._function(path, function)
-        elif isinstance(value, _FUNCTIONS) or not (hasattr(value, "__dict__") or hasattr(type(value), "__slots__")):
-            self.found[path] = getattr(value, "__qualname__", type(value).__qualname__)
+        elif isinstance(value, tuple(_WRAPPERS)):
+            self.found[path] = type(value).__name__
+            for part in next(parts for kind, parts in _WRAPPERS.items() if isinstance(value, kind)):
+                if getattr(value, part) is not None:
+                    self.add(f"{path}.{part.strip('_')}", getattr(value, part))
+        elif name := getattr(value, "__qualname__", None) or getattr(value, "__name__", None):
+            self.found[path] = str(name)  # a library's function that is not written in Python
+            of = getattr(value, "__wrapped__", getattr(value, "__self__", None))
+            if of is not None and not isinstance(of, (type, types.ModuleType)):
+                self.add(f"{path}.of", of)
         else:
-            self._instance(path, value)
-
-    def _instance(self, path: str, value: Any) -> None:
-        self.found[path] = type(value).__qualname__
-        self._class(type(value))
-        attributes = _attributes(value)
-        if is_project(module_of(type(value))):
-            # What it was made with. Other attributes, such as results that it keeps, follow from that.
-            public = {name: item for name, item in attributes.items() if not name.startswith("_")}
-            attributes = _arguments(value, attributes) or public
-        elif not is_user(type(value)):
-            attributes = _library_state(value)
-        else:
-            kept = _internals(type(value))
-            attributes = {name: item for name, item in attributes.items() if name not in kept}
-        for name, item in attributes.items():
-            self.add(f"{path}.{name}", item)
+            self.found[path] = type(value).__qualname__
+            self._class(type(value))
+            for name, item in _state(value).items():
+                self.add(f"{path}.{name}", item)
 
     def _class(self, kind: type) -> None:
-        """The source of a user's class and of its bases, with what its methods use."""
+        """What a user's class and its bases define."""
         for base in kind.__mro__:
-            key = f"class {base.__qualname__}"
-            if not is_user(base) or id(base) in self.paths and self.found.get(key):
+            if not is_user(base) or base in self.classes:
                 continue
-            self.paths[id(base)] = key
-            self.kept.append(base)
-            source = _source(base)
-            self.found[key] = source or "without a source"
+            self.classes.add(base)
+            key = self._free(f"class {base.__qualname__}")
+            self.found[key] = f"of {', '.join(parent.__qualname__ for parent in base.__bases__)}"
             self.found[_USER] = "yes"
+            generated = hasattr(base, "__dataclass_fields__") or hasattr(base, "_fields")
             for name, item in vars(base).items():
-                function = inspect.unwrap(getattr(item, "__func__", getattr(item, "fget", None) or item))
-                if isinstance(function, types.FunctionType):
-                    if function.__code__.co_filename.startswith("<string"):
-                        continue  # a method that @dataclass has written
-                    if source and is_user(function):
-                        self._uses(f"{key}.{name}", function)
-                    else:
-                        self.add(f"{key}.{name}", function)
-                elif not name.startswith(("__", "_abc_")) and not callable(getattr(item, "__get__", None)):
+                if isinstance(item, types.FunctionType):
+                    if not (generated and item.__code__.co_filename.startswith("<")):
+                        self.add(f"{key}.{name}", item)
+                elif not name.startswith(("__", "_abc_")) and not isinstance(item, types.MemberDescriptorType):
                     self.add(f"{key}.{name}", item)
 
     def _function(self, path: str, function: types.FunctionType) -> None:
-        if not (is_user(function) or is_project(module_of(function))):
-            self.found[path] = f"{module_of(function)}.{function.__qualname__}"  # a library's
-            return
-        self.found[path] = _source(function) or _without_source(function.__code__)
         if is_user(function):
             self.found[_USER] = "yes"
+        elif not is_project(module_of(function)):
+            self.found[path] = f"{module_of(function)}.{function.__qualname__}"  # a library's
+            if hasattr(function, "__wrapped__"):
+                self.add(f"{path}.of", function.__wrapped__)
+            return
+        self.found[path] = source_of(function) or without_source(function.__code__)
         self._uses(path, function)
 
     def _uses(self, path: str, function: types.FunctionType) -> None:
-        """Defaults, closures and the globals of a function that are values or the user's code."""
-        variables = inspect.getclosurevars(function).nonlocals if function.__closure__ else {}
-        defaults: dict[Any, Any] = dict(enumerate(function.__defaults__ or ()))
-        defaults |= function.__kwdefaults__ or {}
-        for name, item in [*sorted(variables.items()), *((f"default {key}", item) for key, item in defaults.items())]:
-            if name != "__class__":
-                self.add(f"{path}.{name}", item)
-        names = sorted(_names(function.__code__))
+        """Defaults, closures, imports and the globals of a function that are values or the user's code."""
+        code, names = function.__code__, sorted(names_in(function.__code__))
+        for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
+            if name != "__class__" and cell != types.CellType():
+                self._used(f"{path}.{name}", cell.cell_contents, names)
+        defaults: dict[Any, Any] = dict(enumerate(function.__defaults__ or ())) | (function.__kwdefaults__ or {})
+        for key, item in defaults.items():
+            self.add(f"{path}.default {key}", item)
         for name in names:
-            if name in function.__globals__:
-                self._global(f"{path}.{name}", function.__globals__[name], names)
+            if name in function.__globals__ and not name.startswith("__") and name not in code.co_freevars:
+                item = function.__globals__[name]
+                if not _is_projects(item):
+                    self._used(f"{path}.{name}", item, names)
+        for name in sorted(imports_in(code)):
+            if is_user_module(name):
+                self._used(f"{path}.{name}", importlib.import_module(name), names)
 
-    def _global(self, path: str, item: Any, names: list[str]) -> None:
+    def _used(self, path: str, item: Any, names: Sequence[str], inside: tuple[types.ModuleType, ...] = ()) -> None:
+        """A variable of a function that uses `names`; of a user's module, what has one of those names."""
         if isinstance(item, types.ModuleType):
-            if user_file(item.__name__):
+            if is_user_module(item.__name__) and item not in inside:
                 for name in names:
-                    if name in vars(item):
-                        self._global(f"{path}.{name}", vars(item)[name], names)
-        elif isinstance(item, (type, types.FunctionType)):
-            if is_user(inspect.unwrap(item)):
-                self.add(path, item)
-        elif isinstance(item, _PLAIN) or not (isinstance(item, types.BuiltinFunctionType) or _is_projects(item)):
-            # Python has one object for equal small numbers and short texts, so that the project may have it as well.
+                    if name in vars(item) and not name.startswith("__"):
+                        self._used(f"{path}.{name}", vars(item)[name], names, (*inside, item))
+        elif isinstance(item, logging.Logger) or (_is_library(item) and path.endswith(f".{item.__name__}")):
+            pass  # the source of the function names it
+        else:
             self.add(path, item)
 
 
+def _is_library(item: Any) -> bool:
+    """Whether a variable is a library's function or class."""
+    kinds = (type, types.FunctionType, types.BuiltinFunctionType)
+    bound = isinstance(getattr(item, "__self__", None), (types.ModuleType, type, type(None)))
+    return isinstance(item, kinds) and bound and not is_user(item) and not hasattr(item, "__wrapped__")
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, _PLAIN) and not isinstance(value, (np.generic, Enum))
+
+
 def _plain(value: Any) -> str:
-    """The text of a plain value or a tuple of such; of any other one, the name of its type."""
-    if isinstance(value, tuple):
-        return f"({', '.join(map(_plain, value))})"
-    if isinstance(value, Enum):
-        return str(value)
     if isinstance(value, PurePath):
         return value.name
     if isinstance(value, re.Pattern):
-        return value.pattern if isinstance(value.pattern, str) else repr(value.pattern)
+        return f"{value.pattern!r}, flags {value.flags}"
     if isinstance(value, str):
         return re.sub(r"^/.*/(?=.)", "", value)  # of a path on this machine, the last part
-    return repr(value) if isinstance(value, _PLAIN) else type(value).__name__
+    if isinstance(value, (*_SETS, tuple)):
+        items = map(_plain, value)
+        return f"({', '.join(items if isinstance(value, tuple) else sorted(items))})"
+    return repr(value) if _is_plain(value) else getattr(value, "__qualname__", type(value).__qualname__)
 
 
 def _as_array(value: Any) -> np.ndarray | None:
-    """An array, a tensor or a number of NumPy, as an array."""
+    """An array, a tensor, a number of NumPy or another library's table, as an array."""
     if isinstance(value, (np.ndarray, np.generic)):
         return np.asarray(value)
     if hasattr(value, "detach") and hasattr(value, "cpu"):
         tensor = value.detach().cpu()
         return np.asarray(tensor.double() if tensor.is_floating_point() else tensor)
+    if hasattr(type(value), "__array__") and not is_user(type(value)):
+        return np.asarray(value)
     return None
 
 
 def _array(array: np.ndarray) -> str:
     if array.size <= _PRINTED:
         return repr(array.tolist())
-    if array.dtype.hasobject:
-        return f"array of shape {array.shape}"
     digest = hashlib.sha256(np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes())
     return f"array of shape {array.shape}, checksum {digest.hexdigest()[:12]}"
 
 
-def _attributes(value: Any) -> dict[str, Any]:
-    slots = (name for base in type(value).__mro__ for name in _slots_of(base))
-    return {name: getattr(value, name) for name in slots if hasattr(value, name)} | dict(getattr(value, "__dict__", {}))
+def _state(value: Any) -> dict[str, Any]:
+    """What an object was made with, as far as it tells."""
+    import torch  # only here: reading results needs no torch
+
+    kind = type(value)
+    if not is_user(kind) and not is_project(module_of(kind)):
+        with contextlib.suppress(Exception):  # whatever an object without a text raises
+            repr(value)  # some objects keep their text from then on, as Gymnasium's boxes do
+    slots = (name for base in kind.__mro__ for name in _slots_of(base))
+    attributes = {name: getattr(value, name) for name in slots if hasattr(value, name)}
+    attributes |= getattr(value, "__dict__", {})
+    attributes = {name: item for name, item in attributes.items() if not _is_cached(kind, name)}
+    public = {name: item for name, item in attributes.items() if not name.startswith("_")}
+    if is_project(module_of(kind)):
+        # What it was made with. Other attributes, such as results that it keeps, follow from that.
+        return _arguments(value, attributes) or public
+    if isinstance(value, torch.nn.Module):
+        own = {name: item for name, item in attributes.items() if name not in vars(torch.nn.Module())}
+        return own | value._parameters | value._buffers | value._modules
+    if is_user(kind):
+        kept = _internals(kind)
+        return {name: item for name, item in attributes.items() if name not in kept}
+    if hasattr(value, "__dict__"):  # a library's: its other attributes may change
+        return {name: item for name, item in public.items() if _is_data(item)}
+    return {} if any(base.__name__ in _RANDOM for base in kind.__mro__) else _pickled(value)
+
+
+def _is_cached(kind: type, name: str) -> bool:
+    """Whether an attribute keeps what a property has computed."""
+    return isinstance(inspect.getattr_static(kind, name, None), functools.cached_property)
+
+
+def _pickled(value: Any) -> dict[str, Any]:
+    """What pickle keeps of an object without attributes."""
+    try:
+        parts = value.__reduce_ex__(2)
+    except Exception:  # whatever such an object raises: it cannot be pickled
+        return {}
+    return {"name": parts} if isinstance(parts, str) else {"arguments": parts[1]}
+
+
+def _is_data(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return all(map(_is_data, value.values()))
+    if isinstance(value, (*_SEQUENCES, *_SETS)):
+        return all(map(_is_data, value))
+    return isinstance(value, Enum) or _is_plain(value) or _as_array(value) is not None
 
 
 def _parameters(kinds: Iterable[type]) -> dict[str, None]:
@@ -278,23 +344,8 @@ def _parameters(kinds: Iterable[type]) -> dict[str, None]:
 def _internals(kind: type) -> set[str]:
     """Private attributes in which the project's bases of a user's class keep something, such as a count of calls."""
     bases = [base for base in kind.__mro__ if is_project(module_of(base))]
-    used = {name for base in bases for name in re.findall(r"\bself\.(_\w+)", _source(base))}
+    used = {name for base in bases for name in re.findall(r"\bself\.(_\w+)", source_of(base))}
     return used - {f"_{name}" for name in _parameters(bases)}
-
-
-def _library_state(value: Any) -> dict[str, Any]:
-    """The modules and parameters of a network; of other objects of libraries the public numbers and texts.
-
-    The rest of those may change.
-    """
-    if hasattr(value, "state_dict"):
-        return {"modules": str(value), **value.state_dict()}
-    repr(value)  # some objects keep their text from then on, as Gymnasium's boxes do
-    return {
-        name: item
-        for name, item in _attributes(value).items()
-        if not name.startswith("_") and isinstance(item, (*_PLAIN, np.ndarray))
-    }
 
 
 def _slots_of(base: type) -> Iterator[str]:
@@ -315,56 +366,6 @@ def _arguments(value: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_projects(item: Any) -> bool:
-    """Whether a global was imported from the project, as `TASKS` and its constants are."""
+    """Whether a global is an object that was imported from the project, as `TASKS` is. Values count for themselves."""
     modules = [module for name, module in list(sys.modules.items()) if is_project(name)]
-    return any(item is value for module in modules for value in vars(module).values())
-
-
-def _names(code: types.CodeType) -> set[str]:
-    """The names that a function uses, also those in functions inside it."""
-    inner = (constant for constant in code.co_consts if isinstance(constant, types.CodeType))
-    return set(code.co_names).union(*map(_names, inner))
-
-
-def _source(value: Any) -> str:
-    """The source of a function or a class without comments and blank lines; empty where there is none."""
-    try:
-        if getattr(value, "__name__", "") == "<lambda>":
-            return _lambda_source(value)
-        return _without_comments(textwrap.dedent(inspect.getsource(value)))
-    except (OSError, TypeError, SyntaxError, IndentationError, tokenize.TokenError):
-        return ""
-
-
-def _lambda_source(function: types.FunctionType) -> str:
-    """The source of the lambdas that start in the line of `function`, which is one of them."""
-    text = "".join(linecache.getlines(function.__code__.co_filename, function.__globals__))
-    segments = [
-        ast.get_source_segment(text, node) or ""
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Lambda) and node.lineno == function.__code__.co_firstlineno
-    ]
-    alike = [s for s in segments if _looks_like(s, function.__code__)]
-    return "\n".join(dict.fromkeys(" ".join(segment.split()) for segment in alike or segments))
-
-
-def _looks_like(segment: str, code: types.CodeType) -> bool:
-    inner = next(c for c in compile(f"({segment})", "", "eval").co_consts if isinstance(c, types.CodeType))
-    # A closure's variables are globals in a lambda that is compiled alone.
-    used, here = ({*c.co_names, *c.co_freevars} for c in (code, inner))
-    return (inner.co_varnames, inner.co_consts, here) == (code.co_varnames, code.co_consts, used)
-
-
-def _without_comments(source: str) -> str:
-    lines = source.splitlines()
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            row, column = token.start
-            lines[row - 1] = lines[row - 1][:column]
-    return "\n".join(line.rstrip() for line in lines if line.strip())
-
-
-def _without_source(code: types.CodeType) -> str:
-    """What is known of a function that was typed at a prompt: its constants and names."""
-    constants = [_without_source(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts]
-    return f"without a source; constants {', '.join(constants)}; names {', '.join(sorted(code.co_names))}"
+    return not _is_plain(item) and any(item is value for module in modules for value in vars(module).values())

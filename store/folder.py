@@ -6,12 +6,12 @@
         info.json        versions, git commit, machine, threads, the command that ran, the words of the cell, the user's
                          own sources with their checksums, start time; again for each resumption
         evaluations.csv  step,return_mean,return_1,...,return_k,seconds: one row an evaluation, appended
-        training.csv     step and the algorithm's own measures (SAC: temperature, entropy; TD3: losses, mean Q)
+        training.csv     step, the algorithm's own measures (losses, entropy, ...), and those of core/suggestions.py
         best.pt last.pt  state dicts
         result.json      the final evaluation; written last, so its presence means that the run is finished
         failed.json      instead of result.json if the run diverged: the step, what was not finite, last evaluation,
                          and as `result` the final evaluation of the best parameters before, where there are any
-        checkpoint/      while the run is unfinished: see store/checkpoint.py
+        checkpoint/      while the run is unfinished: see store/checkpoint.py (tensorboard/, wandb/: store/loggers.py)
     results/<task>/<variant>/seed=<n>.lock
                          while a process trains the run: its process id, host and Slurm job; see store/lock.py
     results/sweep/       logs and records of sweeps: see sweep/cells.py
@@ -38,6 +38,7 @@ import numpy as np
 import yaml
 
 from store.files import one_line, replace_file
+from store.loggers import Loggers
 
 LONGEST_NAME = 255
 """Bytes in the name of a folder, at most."""
@@ -114,8 +115,9 @@ def read_definition(folder: str | Path) -> dict[str, dict[str, str]] | None:
     """The definition of the task and of the algorithm in the run in `folder`; None where it has none."""
     try:
         content = _parse(Path(folder, "definition.json"), json.loads)
-        return {part: dict(content[part]) for part in ("task", "algorithm")}
-    except (ValueError, KeyError, TypeError):
+        parts = {part: content[part].items() for part in ("task", "algorithm")}
+        return {part: {key: str(text) for key, text in items} for part, items in parts.items()}
+    except (ValueError, KeyError, AttributeError):
         return None
 
 
@@ -144,7 +146,7 @@ class RunWriter:
         definition: Mapping[str, Any] | None = None,
     ):
         self.folder, self.config = Path(folder), dict(config)
-        self.eval_episodes = eval_episodes
+        self.eval_episodes, self.loggers = eval_episodes, Loggers(self.folder, self.config)
         if self.folder.exists():
             if is_finished(self.folder) and not replace_finished:
                 raise FileExistsError(f"{self.folder} holds a finished run")
@@ -168,6 +170,7 @@ class RunWriter:
         """The writer of a run that resumes. Adds `info` to info.json. The trainer calls `restore_tables`."""
         writer = cls.__new__(cls)
         writer.folder, writer.config, writer.eval_episodes = Path(folder), dict(config), eval_episodes
+        writer.loggers = Loggers(writer.folder, writer.config)
         try:
             first = _parse(writer.folder / "info.json", json.loads)
         except ValueError:  # info.json informs people; the training does not depend on it
@@ -188,6 +191,7 @@ class RunWriter:
                 self._replace(name, tables[name])
             else:
                 (self.folder / name).unlink(missing_ok=True)
+        self.loggers.go_on_after(last_evaluated(self.folder))
 
     def _save_info(self, info: Mapping[str, Any]) -> None:
         self._replace("info.json", json.dumps(info, indent=2) + "\n")
@@ -209,12 +213,14 @@ class RunWriter:
             raise ValueError(f"an evaluation has {self.eval_episodes} returns, got shape {values.shape}")
         row = [str(int(step)), *(repr(float(x)) for x in (values.mean(), *values)), f"{seconds:.2f}"]
         self._append("evaluations.csv", row)
+        self.loggers.log_evaluation(int(step), float(values.mean()), seconds)
 
     def append_statistics(self, step: int, values: Mapping[str, float]) -> None:
         """Append the algorithm's measures at environment step `step`. Their names are the same in every call."""
         if not (self.folder / "training.csv").exists():
             self._append("training.csv", ["step", *values])
         self._append("training.csv", [str(int(step)), *(repr(float(value)) for value in values.values())])
+        self.loggers.log_training(int(step), values)
 
     def last_finite_evaluation(self) -> dict[str, float] | None:
         """Step and mean return of the last evaluation with a finite mean; None if there is none."""
@@ -247,6 +253,7 @@ class RunWriter:
         if self.config.get("quick"):
             result = {**result, "quick": True}
         self._replace("result.json", json.dumps(result, indent=2, default=methodcaller("tolist")) + "\n")
+        self.loggers.log_result(float(result["return_mean"]))
 
     def fail(self, record: Mapping[str, Any]) -> None:
         """Write `failed.json`, which marks the run as one that diverged."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import site
 import sys
 import sysconfig
+import types
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,17 +22,27 @@ def is_project(module: str) -> bool:
 
 def user_file(module: str) -> Path | None:
     """The source file of a loaded module that is neither the project's nor a library's; None for those two."""
-    file = getattr(sys.modules.get(module), "__file__", None)
-    if is_project(module) or not file:
-        return None
-    path = Path(file).resolve()
-    if path in _commands() or any(folder in path.parents for folder in _libraries()):
-        return None
-    return path if path.is_file() and path.suffix == ".py" else None  # some modules invent the name of a file
+    return None if is_project(module) else _user_path(getattr(sys.modules.get(module), "__file__", None))
+
+
+def is_user_module(module: str) -> bool:
+    """Whether a module, loaded or not, is the user's own."""
+    if module in sys.modules or is_project(module):
+        return user_file(module) is not None
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return False
+    return spec is not None and _user_path(spec.origin) is not None
 
 
 def module_of(value: Any) -> str:
-    """The name of the module that defines a function or a class; empty if it tells none."""
+    """The name of the module that defines a function or a class; empty if it tells none.
+
+    Of a function that a decorator has made, that is the decorator's module, whatever the function says.
+    """
+    if isinstance(value, types.FunctionType):
+        return value.__globals__.get("__name__") or ""
     return getattr(value, "__module__", None) or ""
 
 
@@ -47,6 +59,17 @@ def is_user(value: Any) -> bool:
 def user_files() -> list[Path]:
     """The source files of all loaded modules that are neither the project's nor a library's."""
     return sorted({file for module in list(sys.modules) if (file := user_file(module))})
+
+
+def _user_path(file: str | None) -> Path | None:
+    """The path of a source file, if it belongs to neither a library nor the commands."""
+    if not file:
+        return None
+    path = Path(file).resolve()
+    library = {"site-packages", "dist-packages"} & set(path.parts) or any(f in path.parents for f in _libraries())
+    if library or path in _commands():
+        return None
+    return path if path.is_file() and path.suffix == ".py" else None  # some modules invent the name of a file
 
 
 def _main_is_command() -> bool:

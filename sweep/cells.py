@@ -11,13 +11,14 @@ The runs themselves are where runs always are: see store/folder.py.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from algos import ALGORITHMS, PAPER, paper_settings, setting_keys
-from core.config import Config, differences, keys_that_apply, resolve, saved_settings
+from core.config import Config, differences, keys_that_apply, resolve, saved_settings, split_values
 from core.words import ConfigError, known_name, parse_words, split_names
 from envs import TASKS
 from store.files import replace_file
@@ -124,7 +125,7 @@ class Cell(CellFolders):
         words |= parse_variant(self.full_variant)[1]
         words |= {"results": str(self.root.absolute()), "overwrite": json.dumps(config.overwrite)}
         words |= {"device": config.device, "threads": str(config.threads)}
-        words["checkpoint_every"] = str(config.checkpoint_every)
+        words |= {"checkpoint_every": str(config.checkpoint_every), "log": config.log}
         if config.simulator is not None:
             words["simulator"] = config.simulator
         return [*plugin_words(), *(f"{key}={value}" for key, value in words.items())]
@@ -140,8 +141,9 @@ def paper_config(name: str, task: str) -> Config:
 def make_cells(settings: Mapping[str, str]) -> list[Cell]:
     """The cells that `settings` ask for: every algorithm of `algo` on every task of `env`.
 
-    A setting that only some of several algorithms have is applied to those. Raises ConfigError for settings that do
-    not fit.
+    A comma list of values gives a cell for each of them, several lists one for each combination; see `split_values` for
+    what is a list. A setting that only some of several algorithms have is applied to those. Raises ConfigError for
+    settings that do not fit.
     """
     for key, choices in (("algo", [*ALGORITHMS, "paper", "all"]), ("env", [*TASKS, "all"])):
         if key not in settings:
@@ -157,10 +159,20 @@ def make_cells(settings: Mapping[str, str]) -> list[Cell]:
     for task in tasks if "simulator" in settings else ():
         if simulators := TASKS[task].robot.simulators:
             known_name(f"simulator of {task}", settings["simulator"], simulators)
-    return [
-        Cell.of(resolve(paper, {key: text for key, text in settings.items() if applies(key, paper)}))
+    cells = [
+        Cell.of(resolve(paper, words))
         for paper in papers
+        for words in _combinations(paper, {key: text for key, text in settings.items() if applies(key, paper)})
     ]
+    return list(dict.fromkeys(cells))  # 1e-3 and 0.001 are the same cell
+
+
+def _combinations(paper: Config, settings: Mapping[str, str]) -> Iterator[dict[str, str]]:
+    """One value of every setting, in all combinations; the last setting changes fastest."""
+    known = keys_that_apply(paper)
+    values = [split_values(type(paper), key, text) if key in known else [text] for key, text in settings.items()]
+    for combination in product(*values):
+        yield dict(zip(settings, combination, strict=True))
 
 
 def _cell_of(words: Sequence[str]) -> Cell:

@@ -6,32 +6,19 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
-from gymnasium.envs.registration import EnvSpec, load_env_creator
-
-from algos import ALGORITHMS
+from algos import ALGORITHMS, definition
+from algos.definition import changes
 from core.words import ConfigError
 from envs import TASKS
 from store.checkpoint import saved_step
-from store.definition import Description, describe, differences, is_own
+from store.definition import Description, is_own
 from store.folder import has_ended, read_definition
 from sweep.cells import Cell
 
 
 def define(task: str, algo: str) -> dict[str, Description]:
     """The descriptions of the task and of the algorithm, as definition.json has them."""
-    robot, algorithm = TASKS[task].robot, ALGORITHMS[algo]
-    public = {name: getattr(robot, name) for name in dir(robot) if not name.startswith("_")}
-    numbers = {f"robot.{name}": value for name, value in public.items() if isinstance(value, (int, float, str))}
-    simulation = {}
-    if isinstance(spec := getattr(robot, "spec", None), EnvSpec):  # of a GymnasiumRobot, whose code is elsewhere
-        entry = spec.entry_point
-        made_by = load_env_creator(entry) if isinstance(entry, str) else entry
-        simulation = {"environment": made_by, "arguments": spec.kwargs}
-    how = {"agent": algorithm.agent, "map": algorithm.map, "placement": algorithm.placement}
-    return {
-        "task": describe({"constraint": TASKS[task].constraint, "robot": robot, **numbers, **simulation}),
-        "algorithm": describe({**how, "penalty": algorithm.penalty}),
-    }
+    return definition.define(TASKS[task].robot, TASKS[task].constraint, ALGORITHMS[algo])
 
 
 def check_definitions(cells: Sequence[Cell]) -> None:
@@ -56,17 +43,5 @@ def check_definition(folder: Path, now: Mapping[str, Description]) -> None:
                 f"{folder} does not tell on which definition of its task and algorithm it was trained; {way_out}"
             )
         return
-    if changed := what_changed(folder, now):
-        raise ConfigError(f"{folder} {changed}; {way_out}")
-
-
-def what_changed(folder: Path, now: Mapping[str, Description]) -> str:
-    """What differs between `now` and the definition that the run in `folder` was trained on.
-
-    Empty if nothing does, and for a run that is older than definitions.
-    """
-    before = read_definition(folder)
-    for part, description in now.items():
-        if before and (changed := differences(before[part], description)):
-            return f"was trained on another definition of its {part}: {changed}"
-    return ""
+    if changed := changes(folder, now):
+        raise ConfigError(f"{folder} was trained on {changed}; {way_out}")

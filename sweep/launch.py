@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from core.config import AUTO
 from core.words import ConfigError
-from sweep.cells import Cell
+from store.folder import LONGEST_NAME
+from sweep.cells import Cell, format_seeds
 from sweep.definition import check_definitions
 from sweep.exit import Exit
 from sweep.local import run_queue
@@ -16,7 +18,7 @@ from sweep.plan import describe_plan, make_plan, memory_warning
 from sweep.settings import Sweep
 from sweep.slurm import asks_for_gpus, check_gpus, submit
 from sweep.states import job_states
-from sweep.train import check_device, make_env, on_this_machine
+from sweep.train import check_device, check_log, make_env, on_this_machine
 
 
 def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None]) -> Exit:
@@ -32,6 +34,7 @@ def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None
         cells = [Cell.of(replace(cell.config, device=device)) for cell in cells]
     cells = [Cell.of(on_this_machine(cell.config, threads)) for cell in cells]
     settings = cells[0].config  # one command has one device, and overwrites all cells or none
+    check_log(settings.log)  # jobs of Slurm have the same Python and home
     if not on_slurm:
         check_device(settings.device)
         for task, simulator in {(cell.task, cell.config.simulator) for cell in cells if cell.config.simulator}:
@@ -40,6 +43,12 @@ def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None
         raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
     else:
         check_gpus(sweep, settings.device)
+    for cell in cells:
+        if len(os.fsencode(cell.record("log").name)) > LONGEST_NAME:
+            raise ConfigError(
+                f"seed={format_seeds(cell.seeds)} is too long for the name of a log: take seeds without gaps, or"
+                " several commands"
+            )
     check_definitions(cells)
     entries = make_plan(cells, job_states(cells))
     if sweep.settings.dry:

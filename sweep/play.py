@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -13,7 +12,6 @@ import envs
 from algos import Policy, load_policy
 from core.words import ConfigError, parse_words, whole_number
 from envs import ActionConstrainedEnv, InfeasibleActionError
-from sweep.definition import define, what_changed
 from sweep.exit import Exit
 
 USAGE = "run.py play FOLDER [episodes=3] [which=best] [video=FILE.mp4]"
@@ -25,8 +23,7 @@ Film = Callable[[np.ndarray], None]
 def play(words: Sequence[str], stop_if_asked: Callable[[], None] = lambda: None) -> Exit:
     """Run and film the policy in a run's folder, as `USAGE` says, and print the return of each episode.
 
-    The starts of the episodes are the same every time. A line on stderr says if the run was trained on another
-    definition of its task or algorithm. A video shows the feasible set of a two-dimensional action.
+    The starts of the episodes are the same every time. A video shows the feasible set of a two-dimensional action.
     Raises ConfigError for wrong words, a video file that exists already, and what cannot be played or filmed.
     """
     if not words or words[0].partition("=")[0] in ("episodes", "which", "video"):
@@ -35,9 +32,6 @@ def play(words: Sequence[str], stop_if_asked: Callable[[], None] = lambda: None)
     episodes = whole_number("episodes", settings.get("episodes", "3"))
     video = Path(settings["video"]).expanduser() if "video" in settings else None
     policy = load_policy(words[0], settings.get("which", "best"))
-    config = policy.agent.config
-    if changed := what_changed(Path(words[0]).expanduser(), define(config.env, config.algo)):
-        print(f"note: {words[0]} {changed}", file=sys.stderr)
     with closing(_make_env(policy, filmed=video is not None)) as env:
         if video is None:
             _play_episodes(env, policy, episodes, stop_if_asked)

@@ -27,6 +27,8 @@ def load_plugins(words: Sequence[str]) -> list[str]:
     if len(mine) > 1:
         raise ConfigError(f"key {KEY!r} given twice: one {KEY}= takes several files, comma separated")
     for text in mine[0].partition("=")[2].split(",") if mine else ():
+        if not text:
+            raise ConfigError(f"bad value {mine[0].partition('=')[2]!r} for {KEY}: expected Python files (.py)")
         _load(Path(text).expanduser().absolute())
     return [word for word in words if word not in mine]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from core.config import parse_seeds
@@ -18,8 +19,9 @@ def find_cells(root: Path) -> list[CellFolders]:
     cells: dict[CellFolders, None] = {}
     for record in sorted((root / RECORDS).glob("*/*/seed=*.*")):
         if record.suffix in (".log", ".job"):
-            seeds = tuple(parse_seeds(record.stem.removeprefix("seed=")))
-            cells[CellFolders(root, record.parent.parent.name, record.parent.name, seeds)] = None
+            with suppress(ConfigError):  # a file of the user's own
+                seeds = parse_seeds(record.stem.removeprefix("seed="))
+                cells[CellFolders(root, record.parent.parent.name, record.parent.name, seeds)] = None
     known = {folder for cell in cells for folder in cell.folders}
     others: dict[tuple[str, str], list[int]] = {}
     for folder in find_runs(root):

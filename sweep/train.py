@@ -23,6 +23,7 @@ from store.definition import Description
 from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
 from store.interrupt import Interrupted
 from store.lock import run_lock
+from store.loggers import LoggerError, check_loggers, logger_names
 from store.output import forgiving_output
 from store.provenance import command_line, describe_environment
 from sweep.cells import Cell, make_cells
@@ -64,6 +65,7 @@ def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Call
     """
     config, folders = on_this_machine(cell.config), dict(zip(cell.seeds, cell.folders, strict=True))
     torch.set_num_threads(int(config.threads))
+    check_log(config.log)
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
         torch.cuda.set_device(config.device)
@@ -156,6 +158,14 @@ def check_device(name: str) -> None:
     if name not in choices:
         hint = "" if len(choices) > 1 else "; PyTorch sees no CUDA GPU here"
         raise ConfigError(f"bad value {name!r} for device{hint} (choices: {', '.join(choices)})")
+
+
+def check_log(text: str) -> None:
+    """Raise ConfigError if a logger of `text`, a value of `log`, cannot work here."""
+    try:
+        check_loggers(logger_names(text))
+    except LoggerError as error:
+        raise ConfigError(str(error)) from error
 
 
 def make_env(task: str, simulator: str | None) -> envs.ActionConstrainedEnv:

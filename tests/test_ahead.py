@@ -23,6 +23,11 @@ def ahead_of(streams, kinds):
     return streams
 
 
+def test_a_stream_has_only_words_or_none():
+    with pytest.raises(AssertionError, match="only words, or none"):
+        Ahead([torch.Generator()], [[Draw("words", (4,)), Draw("normal", (4,))]], torch.device("cpu"))
+
+
 def step(streams, kinds, number):
     """The draws of step `number`."""
     kind = number % len(kinds)

@@ -54,6 +54,8 @@ def refused(capsys, words):
         ("algo=DPre env=R+N seed=1e3", "bad seed '1e3'"),
         ("algo=DPre env=R+N seed=0-99999", "at most 1000 seeds"),
         ("algo=DPre env=R+N seed=1,,2", "bad seed '1,,2'"),
+        ("algo=DPre env=R+N threads=1000000", "bad value 1000000 for threads: must be auto or from 1 to 1024"),
+        (f"algo=DPre env=R+N jobs=1 seed={','.join(map(str, range(0, 200, 2)))}", "too long for the name of a log"),
         ("algo=NFW env=R+N fw_learning_rate=0", "must be in (0, 1]"),
         ("algo= env=R+N", "expected key=value, got 'algo='"),
         ("algo=DPre,all env=R+n", "did you mean R+N?"),
@@ -211,8 +213,8 @@ def test_constraints_that_cannot_be_made(make, said):
 def test_a_constraint_that_breaks_down_later_says_where(capsys, tmp_path, monkeypatch):
     def bound(obs):
         calls.append(len(obs))
-        # Projections and the environment's checks take turns; the first call that finds no set is a projection's.
-        return ones(obs, 1) * (1.0 if len(calls) < 42 else -5.0)
+        # Projections and violations take turns; the first call that finds no set is a projection's.
+        return ones(obs, 1) * (1.0 if len(calls) < 43 else -5.0)
 
     calls = []
     monkeypatch.setitem(TASKS, "R+X", Task(Reacher, rows(lambda o: ones(o, 1, 2), bound), "a task", "a formula", 20))

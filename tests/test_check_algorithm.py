@@ -103,6 +103,13 @@ class DrawsForAll(TD3):
         return super().explore(obs, range(len(self.seeds)))
 
 
+class RemembersForAll(OrnsteinUhlenbeck):
+    def explore(self, obs, which):
+        suggested = super().explore(obs, which)
+        self.noise.mul_(0.9)
+        return suggested
+
+
 class ForgetsTheMap(TD3):
     def policy(self, which):
         policy = super().policy(which)
@@ -181,6 +188,7 @@ BROKEN = {
     ForgetsItsMemory: r"interrupted and resumed differs .* first in transitions .* memory\(\)",
     CopiesItsMemory: r"memory\(\)\['.*'\] is a copy",
     DrawsForAll: "draws from the stream of position 1; give the streams which=which",
+    RemembersForAll: r"changes memory\(\)\['noise'\] of position 1; .* the rows `which` alone",
     ForgetsTheMap: "violates the constraint by .* the map",
     SharesAMean: "seed 5 learns something else alone than among others",
     RemembersEarlierTrainings: "two trainings of the same seeds differ, first in ",

@@ -3,6 +3,7 @@
 import copy
 import math
 import pickle
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from constraints import (
     HalfSpace,
     LinearConstraint,
     PlanarEllipse,
+    QuadraticConstraint,
     WeightedL1,
     WeightedL1AndEllipse,
     WeightedPositivePart,
@@ -231,6 +233,80 @@ def test_arguments_that_are_of_another_kind():
     with pytest.raises(ValueError, match=r"leading shapes of obs and action do not broadcast: \(5, 3\) and \(4, 2\)"):
         Ball(0.5, 2).project(torch.zeros(5, 3), action)
     assert Ball(np.float32(0.5), np.int64(2)).project(obs, action).shape == (4, 2)
+
+
+def test_arrays_are_refused_by_the_other_methods_too():
+    obs, action = torch.zeros(3), torch.zeros(2)
+    for constraint in (Ball(0.5, 2), LinearConstraint(2, ones(1, 2), ones(1))):
+        for wrong, kind in ([0.0, 0.0], "list"), (np.zeros(3), "ndarray"):
+            said = f"must be a torch.Tensor, got {kind}"
+            with pytest.raises(TypeError, match=f"obs {said}"):
+                constraint.sample(wrong, 3)
+            with pytest.raises(TypeError, match=f"obs {said}"):
+                constraint.least_violation(wrong)
+            for method in (constraint.radial_log_prob, constraint.gauge_log_prob):
+                with pytest.raises(TypeError, match=f"log_prob {said}"):
+                    method(obs, action, wrong)
+            with pytest.raises(TypeError, match=f"mean {said}"):
+                constraint.alpha_log_prob(obs, action, wrong, action)
+            with pytest.raises(TypeError, match=f"std {said}"):
+                constraint.alpha_log_prob(obs, action, action, wrong)
+        with pytest.raises(TypeError, match="integer"):
+            constraint.sample(obs, 2.5)
+    with pytest.raises(TypeError, match="obs must be a torch.Tensor, got ndarray"):
+        LinearConstraint(2, ones(1, 2), ones(1)).explicit(np.zeros(3))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64])
+def test_half_precision_is_refused(dtype):
+    """It would round feasible points out of their set."""
+    constraint, obs, action = Ball(0.05, 2), torch.zeros(3), torch.ones(2, dtype=dtype)
+    for method in (*METHODS, "contains"):
+        with pytest.raises(TypeError, match=f"expected float32 or float64 actions, got {dtype}"):
+            getattr(constraint, method)(obs, action)
+    for method, *more in ("center",), ("sample", 3), ("least_violation",):
+        with pytest.raises(TypeError, match=f"expected float32 or float64 observations, got {dtype}"):
+            getattr(constraint, method)(obs.to(dtype), *more)
+
+
+def test_bounds_of_any_kind_of_number():
+    obs, action = torch.zeros(3), torch.ones(2)
+    for bound in (Fraction(1, 2), np.float16(0.5), np.float64(0.5), True):
+        constraint, same = Ball(bound, 2), Ball(float(bound), 2)
+        for method in (*METHODS, "gauge_map"):
+            assert torch.equal(getattr(constraint, method)(obs, action), getattr(same, method)(obs, action))
+
+
+@pytest.mark.parametrize("what", ["A", "b", "Q", "c"])
+def test_coefficients_that_are_no_functions(what):
+    for wrong, kind in (torch.ones(2, 2), "Tensor"), ([1.0, 2.0], "list"):
+        with pytest.raises(TypeError, match=f"{what} must be a function of the observation, got {kind}"):
+            (LinearConstraint if what in "Ab" else QuadraticConstraint)(2, **{what: wrong})
+
+
+NOT_EACH_ALONE = {
+    "rows without their axis": LinearConstraint(2, lambda obs: obs[..., :2], lambda obs: torch.ones_like(obs[..., 0])),
+    "the first observation's": WeightedL1(lambda obs: obs[0, :2], 1.0, 2),
+    "the batch's mean": WeightedL1(lambda obs: obs.mean(0)[:2], 1.0, 2),
+    "a bound of the whole batch": Ball(lambda obs: 1.0 + obs.square().sum(), 2),
+    "bounds by the batch": LinearConstraint(2, ones(1, 2), lambda obs: (obs / obs.norm())[..., :1]),
+    "a matrix by the batch": QuadraticConstraint(2, lambda obs: torch.eye(2) * (1.0 + obs.square().mean()), 1.0),
+}
+
+
+@pytest.mark.parametrize("name", NOT_EACH_ALONE)
+def test_functions_of_a_batch_are_refused(name):
+    """A function that is right for one observation, or that normalises, gives each sample the set of the others."""
+    obs, action = torch.arange(12.0).view(4, 3), torch.ones(4, 2)
+    with pytest.raises(ConstraintError, match=r"\(obs\) of an observation depends on the others in its batch"):
+        NOT_EACH_ALONE[name].project(obs, action)
+
+
+def test_coefficients_of_a_fixed_batch_pass():
+    rows = torch.arange(8.0).view(4, 1, 2) + 1.0
+    for function, n in (lambda obs: rows, 0), (lambda obs: rows + obs[..., :1, None] * 0.0, 3):
+        constraint = LinearConstraint(2, function, lambda obs: torch.ones(1))
+        assert constraint.project(torch.zeros(4, n), torch.ones(4, 2)).shape == (4, 2)
 
 
 def test_contains():

@@ -306,6 +306,7 @@ def test_what_has_no_transforms_says_so():
     std = torch.ones_like(action)
     for function, what in (
         (constraint.linear_oracle, "linear_oracle"),
+        (lambda o, a: constraint.sample(o, 2), "sample"),
         (lambda o, a: constraint.radial_log_prob(o, a, a.sum(-1)), "the density of the radial map"),
         (lambda o, a: constraint.alpha_log_prob(o, a, a, std[0]), "the density of the alpha map"),
     ):
@@ -322,6 +323,18 @@ def test_vmap_of_general_sets():
         torch.autograd.functional.jacobian(lambda a, k=k: constraint.project(obs[k], a), action[k]) for k in range(4)
     ]
     torch.testing.assert_close(exact, torch.stack(expected))
+
+
+@pytest.mark.parametrize("name", ["rows", "ellipse", "intersection"])
+def test_vmap_of_what_looks_at_values_says_so(name):
+    constraint = general(torch.ones((), dtype=torch.float64))[name]
+    obs, action = torch.rand(4, 3, dtype=torch.float64), torch.rand(4, 2, dtype=torch.float64)
+    for method in ("violation", "penalty", "contains", *MAPS[1:]):
+        with pytest.raises(RuntimeError, match="looks at values, which torch.func.vmap hides"):
+            torch.func.vmap(getattr(constraint, method))(obs, action)
+    for method in (constraint.center, constraint.least_violation):
+        with pytest.raises(RuntimeError, match="looks at values, which torch.func.vmap hides"):
+            torch.func.vmap(method)(obs)
 
 
 @every_set

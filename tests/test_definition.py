@@ -1,9 +1,16 @@
 """A run belongs to the definition of its task and algorithm that it was trained on, not to their names."""
 
+import enum
 import functools
 import json
+import math
+import operator
+import re
 import subprocess
 import sys
+import types
+from collections import deque
+from fractions import Fraction
 from pathlib import Path
 
 import gymnasium
@@ -16,7 +23,18 @@ import envs
 import plot
 from algos import ALGORITHMS, Algorithm
 from algos.td3 import TD3
-from constraints import Ball, Box, Intersection, LinearConstraint, WeightedL1
+from constraints import (
+    Ball,
+    Box,
+    DiagonalEllipse,
+    HalfSpace,
+    Intersection,
+    InUnits,
+    LinearConstraint,
+    PlanarEllipse,
+    QuadraticConstraint,
+    WeightedL1,
+)
 from core.maps import Project
 from envs import TASKS, Task
 from envs.reacher import Reacher
@@ -26,7 +44,6 @@ from sweep.definition import define
 ROOT = Path(__file__).parents[1]
 WORDS = CHECKPOINTED.replace("env=R+N", "env=R+X")
 SCALE = 2.0
-SHARED = 2  # Python has one such number, so that it is also one of the project's
 
 
 def task(constraint, robot=Reacher):
@@ -43,10 +60,6 @@ def times(obs, factor):
 
 def uses_a_global(obs):
     return times(obs, SCALE)
-
-
-def uses_a_small_number(obs):
-    return times(obs, SHARED)
 
 
 class Rows(LinearConstraint):
@@ -80,10 +93,6 @@ def network(weight):
     layer = torch.nn.Linear(2, 1, bias=False)
     torch.nn.init.constant_(layer.weight, weight)
     return layer
-
-
-def activated(activation):
-    return torch.nn.Sequential(network(1.0), activation)
 
 
 def l1(weight):
@@ -130,10 +139,6 @@ def other_project():
         (Project(), other_project(), "the value: Project then, other_project.<locals>.Project2 now"),
         (network(1.0), network(2.0), "the value's weight: [[1.0, 1.0]] then, [[2.0, 2.0]] now"),
         ({"a": 1, "b": (2, 3)}, {"a": 1, "b": (2, 4)}, "the value[b]: 2, 3 then, 2, 4 now"),
-        ({(0, 1): 1, (2, 3): 2}, {(0, 1): 5, (2, 3): 2}, "the value[(0, 1)]: 1 then, 5 now"),
-        ({(0, 1)}, {(0, 2)}, "the value: set ['(0, 1)'] then, set ['(0, 2)'] now"),
-        (np.sin, np.cos, "the value: sin then, cos now"),
-        (activated(torch.nn.ReLU()), activated(torch.nn.Tanh()), "(1): ReLU() then, (1): Tanh() now"),
     ],
 )
 def test_what_differs_is_said(before, now, said):
@@ -165,12 +170,130 @@ def test_globals_count(monkeypatch):
     assert differences(before, describe({"value": uses_a_global})) == "the value's SCALE: 2.0 then, 3.0 now"
 
 
-@pytest.mark.parametrize("value", [3, True, None, "algo"])
-def test_globals_count_that_are_the_same_object_in_the_project(monkeypatch, value):
-    before = describe({"value": uses_a_small_number})
-    monkeypatch.setitem(globals(), "SHARED", value)
-    said = differences(before, describe({"value": uses_a_small_number}))
-    assert said == f"the value's SHARED: 2 then, {value if value == 'algo' else repr(value)} now"
+MODE = enum.Enum("Mode", {"TIGHT": 0.1})
+
+
+@pytest.mark.parametrize(
+    "before, now",
+    [
+        (2, 3),  # small numbers and texts are the same objects in the project's modules
+        ("task", "algorithm"),
+        (slice(6, 9, 2), slice(0, 3)),
+        (np.s_[..., 6:9:2], np.s_[..., :2]),
+        ({(0, 1)}, {(0, 2)}),
+        ({(0, 1): 1.0, (1, 2): 2.0}, {(0, 1): 5.0, (1, 2): 2.0}),
+        ({1: "a", "1": "b"}, {1: "c", "1": "b"}),
+        (deque([1]), deque([2])),
+        (Fraction(1, 2), Fraction(1, 3)),
+        (np.sin, np.cos),
+        (math.sin, math.cos),
+        (torch.nn.functional.relu, torch.nn.functional.silu),
+        (operator.itemgetter(1), operator.itemgetter(2)),
+        (torch.float32, torch.float64),
+        (torch.ones(2).mul, torch.zeros(2).mul),
+        (types.SimpleNamespace(rows=[1]), types.SimpleNamespace(rows=[2])),
+        (np.poly1d([1, 2]), np.poly1d([1, 3])),
+        (torch.distributions.Normal(0.0, 1.0), torch.distributions.Normal(0.0, 2.0)),
+        (torch.nn.Sequential(torch.nn.ReLU()), torch.nn.Sequential(torch.nn.Tanh())),
+        (np.array([None] * 20 + [1]), np.array([None] * 20 + [2])),
+        (re.compile("a"), re.compile("a", re.DOTALL)),
+        (MODE.TIGHT, enum.Enum("Mode", {"TIGHT": 0.2}).TIGHT),
+    ],
+)
+def test_any_value_counts(before, now, monkeypatch):
+    monkeypatch.setitem(globals(), "SCALE", before)
+    one = describe({"value": uses_a_global})
+    assert differences(one, describe({"value": uses_a_global})) == ""
+    other = describe({"value": now})
+    monkeypatch.setitem(globals(), "SCALE", now)
+    assert "value's SCALE" in differences(one, describe({"value": uses_a_global}))
+    assert differences(describe({"value": before}), other)
+
+
+def test_each_argument_of_a_constraint_counts():
+    def eye(obs):
+        return torch.eye(2).expand(*obs.shape[:-1], 2, 2)
+
+    one, two = scaled(1.0), scaled(2.0)
+    cases = [
+        (Ball, {"bound": 0.5, "dim": 2}, {"bound": one}),
+        (HalfSpace, {"normal": one, "bound": 1.0, "dim": 2}, {"normal": two, "bound": 2.0}),
+        (PlanarEllipse, {"matrix": eye, "bound": 1.0}, {"matrix": lambda obs: 2 * eye(obs), "bound": 2.0}),
+        (DiagonalEllipse, {"scale": one, "bound": 1.0, "dim": 2}, {"scale": two, "bound": one}),
+        (LinearConstraint, {"dim": 2, "A": eye, "b": one}, {"A": one, "b": two, "on_empty": "least"}),
+        (QuadraticConstraint, {"dim": 2, "Q": eye, "bound": 1.0}, {"Q": one, "bound": 2.0, "c": one}),
+        (InUnits, {"constraint": Ball(0.5, 2), "low": [-1, -1], "high": [1, 1]}, {"low": [-2, -1], "high": [1, 2]}),
+    ]
+    for kind, arguments, others in cases:
+        before = describe({"value": kind(**arguments)})
+        for name, value in others.items():
+            assert differences(before, describe({"value": kind(**arguments | {name: value})})), (kind, name)
+
+
+def test_lambdas_in_one_line_are_told_apart():
+    one, two = lambda obs: obs + SCALE, lambda obs: obs - SCALE
+    assert describe({"value": one})["value"] == "lambda obs: obs + SCALE"
+    assert describe({"value": two})["value"] == "lambda obs: obs - SCALE"
+
+
+def test_what_a_decorator_adds_counts():
+    def decorated(factor):
+        def decorate(function):
+            @functools.wraps(function)
+            def inner(obs):
+                return function(obs) * factor
+
+            return inner
+
+        return decorate(uses_a_global)
+
+    said = differences(describe({"value": decorated(2.0)}), describe({"value": decorated(3.0)}))
+    assert said == "the value's factor: 2.0 then, 3.0 now"
+
+
+class Computed:
+    @functools.cached_property
+    def weight(self):
+        return SCALE
+
+    @property
+    def half(self):
+        return SCALE / 2
+
+    def __call__(self, obs):
+        return times(obs, self.weight)
+
+
+def test_what_properties_use_counts_and_what_they_keep_does_not(monkeypatch):
+    value = Computed()
+    before = describe({"value": value})
+    value(torch.zeros(9))
+    assert differences(before, describe({"value": value})) == ""
+    monkeypatch.setitem(globals(), "SCALE", 3.0)
+    assert "SCALE in class Computed: 2.0 then, 3.0 now" in differences(before, describe({"value": value}))
+
+
+def test_modules_count_wherever_they_are_imported(tmp_path, monkeypatch):
+    """At the call, around the function, and where two of them import each other."""
+    (tmp_path / "own_rows").mkdir()
+    (tmp_path / "own_rows" / "__init__.py").write_text("from own_rows import table\nBOUND = 1.0\n")
+    (tmp_path / "own_rows" / "table.py").write_text("import own_rows\nROWS = 1\n")
+    (tmp_path / "own_late.py").write_text("ROWS = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    import own_rows
+
+    def late(obs):
+        import own_late
+
+        return obs * own_late.ROWS
+
+    def around(obs):
+        return obs * own_rows.table.ROWS * own_rows.table.own_rows.BOUND
+
+    before = {function: describe({"value": function}) for function in (late, around)}
+    sys.modules["own_late"].ROWS = own_rows.table.ROWS = 2
+    for function, description in before.items():
+        assert "ROWS: 1 then, 2 now" in differences(description, describe({"value": function}))
 
 
 def test_a_function_that_a_function_calls_counts(monkeypatch):
@@ -184,7 +307,11 @@ def test_a_function_that_a_function_calls_counts(monkeypatch):
 
 
 def test_comments_and_blank_lines_do_not_count(tmp_path):
-    codes = ["def f(x):\n    return x\n", "def f(x):  # the identity\n\n    # as it says\n    return x  # x\n"]
+    codes = [
+        "def f(x):\n    return x\n",
+        "def f(x):  # the identity\n\n    # as it says\n    return x  # x\n",
+        'def f(x):\n    """The identity.\n\n    # It is."""\n\n    return x\n',
+    ]
     found = []
     for i, code in enumerate(codes):
         path = tmp_path / f"m{i}.py"
@@ -192,7 +319,7 @@ def test_comments_and_blank_lines_do_not_count(tmp_path):
         namespace = {"__name__": "nowhere"}
         exec(compile(code, str(path), "exec"), namespace)
         found.append(describe({"value": namespace["f"]})["value"])
-    assert found[0] == found[1] == "def f(x):\n    return x"
+    assert found[0] == found[1] == found[2] == "def f(x):\n    return x"
 
 
 def test_the_papers_tasks_and_algorithms_are_the_projects_own():
@@ -204,14 +331,17 @@ def test_the_papers_tasks_and_algorithms_are_the_projects_own():
 
 
 PROGRAM = """
-import json, sys, torch
+import json, logging, sys, torch
 import numpy as np
 from constraints import LinearConstraint, WeightedL1
 from store.definition import describe
 
 LIMITS = {"b": 2.0, "a": [1, 2, 3], 3: {"x", "y", "z"}}
 
+log = logging.getLogger(__name__)
+
 def weight(obs):
+    log.debug("weight of %s in %s", obs, __file__)
     return obs[..., 6:9:2] * LIMITS["b"] * max(x for x in LIMITS["a"])
 
 class Barrier(LinearConstraint):
@@ -242,6 +372,43 @@ def test_a_description_is_the_same_in_every_process(tmp_path):
             found.append(json.loads(done.stdout))
     assert all(other == found[0] for other in found) and "0x" not in json.dumps(found[0])
     assert "class Barrier" in found[0] and found[0]["one.dim"] == "2"
+
+
+def test_a_program_without_a_file(tmp_path):
+    """What comes from a pipe has no source; its code still counts, and the order of a set does not."""
+    program = """
+import json
+from constraints import WeightedL1
+from store.definition import describe
+mode = "a"
+print(json.dumps(describe({"value": WeightedL1(lambda obs: obs + (mode in {"a", "b", "c", "d"}), 0.5, 2)})))
+"""
+    found = []
+    for seed, text in (("1", program), ("2", program), ("2", program.replace("obs +", "obs -"))):
+        environment = {"PYTHONPATH": f"{ROOT}", "PYTHONHASHSEED": seed, "PATH": "/usr/bin"}
+        done = subprocess.run(
+            [sys.executable, "-"],
+            input=text,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            env=environment,
+            timeout=120,
+        )
+        assert done.returncode == 0, done.stderr
+        found.append(json.loads(done.stdout))
+    assert found[0] == found[1] != found[2]
+
+
+def test_libraries_outside_of_the_environment_are_libraries(tmp_path, monkeypatch):
+    """As on clusters, whose modules put their own folders of packages into PYTHONPATH."""
+    folder = tmp_path / "apps" / "site-packages"
+    folder.mkdir(parents=True)
+    (folder / "far_library.py").write_text("def f(x):\n    return x\n")
+    monkeypatch.syspath_prepend(folder)
+    import far_library
+
+    assert is_own(describe({"value": far_library.f}))
 
 
 @pytest.fixture
@@ -279,32 +446,54 @@ def test_a_finished_run_of_another_definition_is_not_taken_for_this_one(tmp_path
         assert "the robot: Reacher then, Slow now" in capsys.readouterr().err
 
 
-class Counts:
-    """The weights of a set; it counts its calls."""
-
-    def __init__(self):
-        self.calls = 0
-
-    def __call__(self, obs):
-        self.calls += 1
-        return obs[..., 6:9:2]
+CALLS = []
 
 
-def test_a_definition_does_not_depend_on_the_cells_trained_before(tmp_path, define_task):
-    for words in (WORDS.replace("algo=DPre", "algo=DPre,DPro"), WORDS.replace("algo=DPre", "algo=DPro")):
-        define_task(l1(Counts()))
-        assert run_command(command(tmp_path, words=words)) == 0
+def counts_its_calls(obs):
+    CALLS.append(1)
+    return times(obs, SCALE)
 
 
-def test_play_says_that_the_task_has_changed(tmp_path, capsys, define_task):
-    define_task(Ball(0.05, 2))
-    assert run_command(command(tmp_path)) == 0
-    (folder,) = tmp_path.glob("R+X/*/seed=3")
-    assert run_command(["play", str(folder), "episodes=1"]) == 0 and "note" not in capsys.readouterr().err
-    define_task(Ball(0.9, 2))
-    assert run_command(["play", str(folder), "episodes=1"]) == 0
-    said = "was trained on another definition of its task: the constraint's bound: 0.05 then, 0.9 now"
-    assert f"note: {folder} {said}" in capsys.readouterr().err
+def test_what_a_function_remembers_is_not_part_of_a_later_cell(tmp_path, capsys, define_task):
+    CALLS.clear()
+    define_task(l1(counts_its_calls))
+    both = command(tmp_path, words=WORDS.replace("algo=DPre", "algo=DPre,DOpt"))
+    assert run_command(both) == 0 and CALLS
+    CALLS.clear()  # as in another process
+    capsys.readouterr()
+    assert run_command(command(tmp_path, words=WORDS.replace("algo=DPre", "algo=DOpt"))) == 0
+    assert "already finished" in capsys.readouterr().out
+
+
+def test_an_environment_of_ones_own_counts_for_gymnasium_robot(tmp_path):
+    def environment(power):
+        class Environment(gymnasium.Env):
+            observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+            action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+            power_of_reward = power
+
+        return Environment
+
+    found = []
+    try:
+        for power, settings in ((1, {}), (2, {}), (2, {"slow": True})):
+            gymnasium.registry.pop("Own-v0", None)
+            gymnasium.register("Own-v0", entry_point=environment(power), max_episode_steps=5, kwargs=settings)
+            robot = type("Own", (Reacher,), {"identifier": "Own-v0"})
+            TASKS["R+X"] = task(Ball(0.5, 2), robot)
+            found.append(define("R+X", "DPre")["task"])
+            del TASKS["R+X"]
+    finally:
+        gymnasium.registry.pop("Own-v0", None)
+        TASKS.pop("R+X", None)
+    assert "1 then, 2 now" in differences(found[0], found[1])
+    assert "slow" in differences(found[1], found[2])
+
+
+def test_a_librarys_gymnasium_environment_is_its_name(define_task):
+    define_task(Ball(0.05, 1), envs.GymnasiumRobot("Pendulum-v1"))
+    task = define("R+X", "DPre")["task"]
+    assert is_own(task) and task["robot.identifier"] == "Pendulum-v1" and task["robot.environment"] == "PendulumEnv"
 
 
 def test_a_run_does_not_resume_under_another_definition(tmp_path, capsys, define_task):
@@ -343,57 +532,6 @@ def test_an_algorithm_of_ones_own_has_a_definition_too(tmp_path, capsys, name_al
     assert "another definition of its algorithm: the agent" in capsys.readouterr().err
 
 
-GAIN = 2.0
-
-
-class Elsewhere(gymnasium.Env):
-    observation_space = gymnasium.spaces.Box(-9.0, 9.0, (3,), np.float64)
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float64)
-
-    def __init__(self, render_mode=None, factor=1.0):
-        self.factor = factor
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.np_random.uniform(-1.0, 1.0, 3), {}
-
-    def step(self, action):
-        return np.append(action, GAIN * self.factor), 0.0, False, False, {}
-
-
-@pytest.fixture
-def register():
-    """The robot of a Gymnasium environment that is registered anew."""
-
-    def give(**arguments):
-        gymnasium.registry.pop("Elsewhere-v0", None)
-        envs.GymnasiumRobot.cache_clear()
-        gymnasium.register("Elsewhere-v0", entry_point=Elsewhere, max_episode_steps=20, kwargs=arguments)
-        return envs.GymnasiumRobot("Elsewhere-v0")
-
-    yield give
-    gymnasium.registry.pop("Elsewhere-v0", None)
-    envs.GymnasiumRobot.cache_clear()
-
-
-def test_the_code_of_a_gymnasium_environment_counts(monkeypatch, define_task, register):
-    define_task(Ball(0.05, 2), register())
-    before = define("R+X", "DPre")["task"]
-    assert not is_own(before)
-    monkeypatch.setitem(globals(), "GAIN", 3.0)
-    assert differences(before, define("R+X", "DPre")["task"]) == "step.GAIN in class Elsewhere: 2.0 then, 3.0 now"
-    monkeypatch.setitem(globals(), "GAIN", 2.0)
-    define_task(Ball(0.05, 2), register(factor=2.0))
-    said = differences(before, define("R+X", "DPre")["task"])
-    assert said == "the arguments[factor]: none then, 2.0 now"
-
-
-def test_a_librarys_gymnasium_environment_is_its_name(define_task):
-    define_task(Ball(0.05, 1), envs.GymnasiumRobot("Pendulum-v1"))
-    task = define("R+X", "DPre")["task"]
-    assert is_own(task) and task["robot.identifier"] == "Pendulum-v1" and task["environment"] == "PendulumEnv"
-
-
 def test_runs_without_a_definition(tmp_path, capsys, define_task):
     """Runs of the project's own tasks are older than definitions; of others, nobody knows what they were trained on."""
     define_task(Ball(0.05, 2))
@@ -404,6 +542,17 @@ def test_runs_without_a_definition(tmp_path, capsys, define_task):
     define_task(l1(scaled(1.0)))
     assert run_command(command(tmp_path)) == 2
     assert "does not tell on which definition" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", ['{"task": {"constraint": 3}, "algorithm": {}}', "[]", '{"task": []}'])
+def test_a_damaged_definition_is_no_traceback(tmp_path, capsys, define_task, content):
+    define_task(l1(scaled(1.0)))
+    assert run_command(command(tmp_path)) == 0
+    for path in tmp_path.rglob("definition.json"):
+        path.write_text(content)
+    assert run_command(command(tmp_path)) == 2
+    assert "definition of its task" in capsys.readouterr().err
+    assert plot.main([str(tmp_path), "format=csv"]) == 0
 
 
 def test_plots_keep_runs_of_two_definitions_apart(tmp_path, capsys, define_task):

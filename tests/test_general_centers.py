@@ -44,6 +44,12 @@ def wedge(count: int) -> tuple[Tensor, Tensor]:
     return torch.stack((upper, lower), -2), torch.full((count, 2), 0.1, dtype=torch.float64)
 
 
+def wedge_off_centre(count: int) -> tuple[Tensor, Tensor]:
+    """The same wedge, away from the origin."""
+    rows, bounds = wedge(count)
+    return rows, bounds + 0.5 * torch.tensor([1.0, -1.0], dtype=torch.float64)
+
+
 def row_in_and_out(count: int) -> tuple[Tensor, Tensor]:
     """A third row passes through a corner of the others, which are met by the box at first."""
     shift = torch.linspace(1.2, -0.6, count, dtype=torch.float64)
@@ -58,7 +64,7 @@ def row_vanishes(count: int) -> tuple[Tensor, Tensor]:
     return w.double().unsqueeze(-2), torch.full((count, 1), -1.0, dtype=torch.float64)
 
 
-PATHS = [slab, slab_off_centre, wedge, row_in_and_out, row_vanishes]
+PATHS = [slab, slab_off_centre, wedge, wedge_off_centre, row_in_and_out, row_vanishes]
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -82,6 +88,42 @@ def test_center_is_continuous_on_random_paths(seed):
         center = fixed(torch.lerp(ends[0], ends[1], share), torch.full((count, rows), 0.3)).center(no_obs(count))
         steps.append(center.diff(dim=0).norm(dim=-1).max().item())
     assert steps[1] <= 0.2 * steps[0] + 1e-9
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_center_is_continuous_where_an_ellipse_is_added(path):
+    steps = []
+    for count in (201, 2001):
+        rows, bounds = path(count)
+        dim = rows.shape[-1]
+        both = Intersection(fixed(rows, bounds), QuadraticConstraint(dim, lambda obs, d=dim: torch.eye(d), 2.0))
+        center = both.center(no_obs(count))
+        assert both.violation(no_obs(count), center).max() < 0.0
+        steps.append(center.diff(dim=0).norm(dim=-1).max().item())
+    assert steps[1] <= 0.2 * steps[0] + 1e-6
+
+
+@pytest.mark.parametrize("width", [0.3, 1e-3, 1e-6, 3e-8])
+def test_center_of_a_long_ellipse_that_turns_outside_the_box(width):
+    """Its deepest points are along its axis, and many are equally deep."""
+
+    def matrix(obs: Tensor) -> Tensor:
+        axis, across = torch.stack((obs.cos(), obs.sin()), -1), torch.stack((-obs.sin(), obs.cos()), -1)
+        return axis.mT @ axis / 9.0 + across.mT @ across / width**2
+
+    turn = torch.linspace(-0.3, 0.3, 301, dtype=torch.float64).unsqueeze(-1)
+    ellipse = QuadraticConstraint(2, matrix, 1.0, lambda obs: obs.new_tensor([1.5, 0.0]))
+    center = ellipse.center(turn)
+    assert ellipse.violation(turn, center).max() < 0.0
+    assert center.diff(dim=0).norm(dim=-1).max() <= 0.02
+
+
+def test_several_centres_for_one_action():
+    constraint = fixed(torch.eye(2, dtype=torch.float64), torch.full((2,), 0.5))
+    obs, action, center = torch.zeros(3), torch.ones(2), torch.tensor([[0.0, 0.0], [0.2, 0.0], [-0.5, 0.1]])
+    for method in (constraint.gauge, constraint.alpha_map, constraint.gauge_map):
+        expected = torch.stack([method(obs, action, each) for each in center])
+        torch.testing.assert_close(method(obs, action, center), expected)
 
 
 def test_a_small_turn_is_a_small_step():

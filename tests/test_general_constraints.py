@@ -601,3 +601,13 @@ def test_projection_where_the_centre_of_an_ellipse_is_near_a_face(near_face):
     outward = torch.nn.functional.normalize(target - closest, dim=-1)
     furthest = constraint.linear_oracle(no_obs(n), outward)
     assert ((furthest - closest) * outward).sum(-1).max() <= 1e-10
+
+
+def test_a_singular_newton_step_is_no_solution():
+    """Its multipliers are so large that their rounding looks like the solution's."""
+    scale = [0.0, 0.0015064103909502283, 0.0035943187159001937, 0.0002779760499204668]
+    target = [0.5510522904313183, -5.796111446988481, -2.1162425796169337, -2.257719301052732]
+    ellipse = DiagonalEllipse(lambda obs: obs.new_tensor(scale), 0.004998776954459892, 4)
+    obs, action = torch.zeros(1, dtype=torch.float64), torch.tensor(target, dtype=torch.float64)
+    expected = ellipse.project(obs, action)
+    torch.testing.assert_close(Intersection(ellipse).project(obs, action), expected, rtol=0.0, atol=1e-9)

@@ -39,7 +39,9 @@ def build() -> dict[str, Constraint]:
         "closed forms": Intersection(
             WeightedL1(lambda obs: obs[..., :3], 1.0, 3), DiagonalEllipse(lambda obs: obs[..., :3].square(), 0.3, 3)
         ),
-        "units": InUnits(Intersection(linear, DiagonalEllipse(lambda obs: obs[..., :3].square(), 0.3, 3)), -1.5, 2.0),
+        "units": InUnits(
+            Intersection(linear, ellipse, WeightedL1(lambda obs: obs[..., :3], 1.0, 3)), -2.0, [1.0, 2.0, 3.0]
+        ),
         "empty": LinearConstraint(3, rows, lambda obs: obs[..., :2] - 9.0, on_empty="least"),
     }
 
@@ -78,6 +80,18 @@ def test_default_device_and_dtype(name, device, dtype, defaults):
     torch.set_default_dtype(dtype or torch.float32)
     for actual, wanted in zip(everything(build()[name], obs, action), expected, strict=True):
         assert actual.device == wanted.device and actual.dtype == wanted.dtype and torch.equal(actual, wanted)
+
+
+@pytest.mark.parametrize("name", build())
+def test_built_in_inference_mode(name):
+    with torch.inference_mode():
+        constraint = build()[name]
+    obs, action = data()
+    obs.requires_grad_(name != "empty")
+    value = constraint.project(obs, action.requires_grad_())
+    expected = build()[name].project(obs, action)
+    torch.testing.assert_close(value, expected, rtol=0.0, atol=0.0)
+    value.sum().backward()
 
 
 @pytest.mark.parametrize("name", build())

@@ -200,9 +200,8 @@ class Still(Robot):
 @pytest.mark.parametrize("project", [False, True])
 def test_an_environment_admits_the_least_violation(project, monkeypatch):
     for on_empty in ("error", "least"):
-        name = f"X+{on_empty}"
-        monkeypatch.setitem(TASKS, name, Task(Still, linear(on_empty), "empty after a step", "", 1000))
-        env = envs.make(name, project=project)
+        monkeypatch.setitem(TASKS, f"X+{on_empty}", Task(Still, linear(on_empty), "empty after a step", "", 1000))
+        env = envs.make(f"X+{on_empty}", project=project)
         env.reset(seed=0)
         inside = env.constraint.project(torch.tensor([0.5, 0.0]).double(), torch.zeros(2).double()).numpy()
         env.step(inside)

@@ -20,7 +20,12 @@ EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n(?:(?!^## ).)*?```python\n(.*?)```", 
 
 
 def test_each_example_is_complete_python():
-    assert set(EXAMPLES) == {"Stable-Baselines3", "A plain training loop", "TorchRL"}
+    assert set(EXAMPLES) == {
+        "Stable-Baselines3",
+        "A plain training loop",
+        "TorchRL",
+        "The tasks of this benchmark",
+    }
     for code in EXAMPLES.values():
         assert ast.parse(code).body
         assert max(map(len, code.splitlines())) <= 120
@@ -49,6 +54,11 @@ def test_the_plain_loop_trains_within_its_power_limit(capsys):
     obs, executed = names["replay"][:, :17], names["replay"][:, 17:23]
     power = np.abs(executed * obs[:, 11:17]).sum(-1)
     assert power.max() == pytest.approx(20.0, abs=1e-3) and (power > 19.9).mean() > 0.05
+
+
+def test_the_tasks_of_this_benchmark_run_as_printed(capsys):
+    exec(compile(EXAMPLES["The tasks of this benchmark"], "tasks", "exec"), {"__name__": "example"})
+    assert re.match(r"\[[-.\d e]+\]\n", capsys.readouterr().out)
 
 
 def test_the_picture_of_the_docs_has_the_training_that_never_exceeds_the_limit(tmp_path, capsys):

@@ -1,18 +1,22 @@
 """Policies of runs: `algos.load_policy`, and `run.py play` with its video."""
 
 import os
+import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+import yaml
 from helpers import break_off, run_command, train
 
 import envs
 from algos import load_policy
+from constraints import Ball
 from core.random import stream_seed
 from core.words import ConfigError
 from envs import TASKS, TOLERANCE, Task
@@ -113,6 +117,48 @@ def test_a_run_of_a_task_of_ones_own(tmp_path, monkeypatch):
     monkeypatch.delitem(TASKS, "R+Own")
     with pytest.raises(ConfigError, match=r"unknown task 'R\+Own'"):
         load_policy(folder)
+
+
+def test_a_policy_of_a_task_that_has_changed_says_so(tmp_path, monkeypatch):
+    robot = TASKS["R+M"].robot
+    monkeypatch.setitem(TASKS, "R+Own", Task(robot, Ball(0.05, 2), "own", "own", 40))
+    train(tmp_path, f"algo=DAlpha env=R+Own seed=0 {SHORT}")
+    (folder,) = find_runs(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_policy(folder)
+    monkeypatch.delitem(TASKS, "R+Own")
+    monkeypatch.setitem(TASKS, "R+Own", Task(robot, Ball(0.9, 2), "own", "own", 40))
+    with pytest.warns(UserWarning, match="another definition of its task: .*bound: 0.05 then, 0.9 now"):
+        load_policy(folder)
+
+
+@pytest.mark.parametrize(
+    "content, said",
+    [
+        (b"", "is damaged: EOFError"),
+        ([1, 2], "has no table of tensors"),
+        (torch.ones(3), "has no table of tensors"),
+        ({"actor.layers.0.weight": [1.0]}, "has no table of tensors"),
+    ],
+)
+def test_parameters_that_are_none_are_refused(finished, tmp_path, content, said):
+    copied = shutil.copytree(finished, tmp_path / "seed=0")
+    if isinstance(content, bytes):
+        (copied / "best.pt").write_bytes(content)
+    else:
+        torch.save(content, copied / "best.pt")
+    with pytest.raises(ConfigError, match=said):
+        load_policy(copied)
+
+
+@pytest.mark.parametrize("key, value, said", [("env", None, "not the folder of a run"), ("hidden", "big", "bad conf")])
+def test_configurations_that_are_none_are_refused(finished, tmp_path, key, value, said):
+    copied = shutil.copytree(finished, tmp_path / "seed=0")
+    settings = yaml.safe_load((copied / "config.yaml").read_text())
+    (copied / "config.yaml").write_text(yaml.safe_dump(settings | {key: value}))
+    with pytest.raises(ConfigError, match=said):
+        load_policy(copied)
 
 
 def test_what_is_no_policy_is_refused(finished, tmp_path):

@@ -619,11 +619,11 @@ def test_refusals(tmp_path, capsys):
     assert "choices: md, csv, tex, png, pdf" in refused_by_plot(capsys, tmp_path, "format=jpg")
     assert "given twice" in refused_by_plot(capsys, tmp_path, "env=W+M", "env=R+N")
     assert "expected key=value, got 'env='" in refused_by_plot(capsys, tmp_path, "env=")
-    assert "expected one folder of results" in refused_by_plot(capsys, tmp_path, "more")
+    assert "more is not a folder" in refused_by_plot(capsys, tmp_path, "more")
     assert "unexpected 'more'" in refused_by_plot(capsys, "maps", "more")
     assert "env= applies to a folder of results, not to tables" in refused_by_plot(capsys, "tables", "env=W+M")
     assert "choices: png, pdf" in refused_by_plot(capsys, "maps", "format=md")
-    assert "expected one folder of results" in refused_by_plot(capsys, "env=W+M")
+    assert "expected a folder of results, got none" in refused_by_plot(capsys, "env=W+M")
     assert "no readable runs" in refused_by_plot(capsys, tmp_path, "env=W+M", "algo=DPre+")
     blocked = tmp_path / "file"
     blocked.write_text("")

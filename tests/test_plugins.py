@@ -140,6 +140,14 @@ def test_plugin_twice(capsys):
     assert "one plugin= takes several files" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("value", ["", "a.py,", ","])
+def test_a_plugin_without_a_name(tmp_path, monkeypatch, capsys, value):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.py").write_text("")
+    assert run_command(["status", str(tmp_path), f"plugin={value}"]) == 2
+    assert f"bad value {value!r} for plugin" in capsys.readouterr().err
+
+
 def test_a_name_is_registered_once_and_fits_on_a_command_line():
     with pytest.raises(ValueError, match="the algorithm 'DPre' exists: take another name, or delete it first"):
         ALGORITHMS["DPre"] = ALGORITHMS["DPro"]

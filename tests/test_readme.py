@@ -9,7 +9,7 @@ import pytest
 from algos import ALGORITHMS, PAPER
 from envs import TASKS
 from plots.paper import read_paper
-from plots.reproduced import DATA, TABLES, overview, read_cells, replace_table
+from plots.reproduced import DATA, TABLES, details, overview, read_cells, replace_table
 from store.published import PublishedRun, read_published, write_published
 
 ROOT = Path(__file__).parents[1]
@@ -78,6 +78,23 @@ def test_a_run_with_other_settings_or_without_result_is_not_reproduced(tmp_path)
     assert {task: list(by_algo) for task, by_algo in cells.items()} == {"R+L2": ["DPro"]}
     result = pro.run.result["return_mean"]
     assert overview(cells).splitlines()[2:] == [f"| DPro | **{result:.2f}** (n=1) / -4.65 ± 0.59 |"]
+
+
+def test_runs_that_diverged_count_with_their_best_parameters_and_are_marked(tmp_path):
+    published = next(published for published in read_published(DATA, ["R+L2"], ["DPre"]))
+    finished = published.run
+    failure = {"step": 9, "quantity": "critic loss", "largest_violation": 2e-7}
+    failure["result"] = {"return_mean": 1.0, "returns": [1.0], "best_step": 5}
+    diverged = replace(finished, seed=1000, result=None, failure=failure)
+    without = replace(diverged, seed=1001, failure={"step": 9, "quantity": "critic loss"})
+    write_published(tmp_path / "R+L2", [PublishedRun(run, published.info) for run in (finished, diverged, without)])
+    cells = read_cells(tmp_path)
+    assert [run.seed for run in cells["R+L2"]["DPre"]] == [finished.seed, 1000]
+    mean = (finished.result["return_mean"] + 1.0) / 2
+    assert re.search(rf"\*\*{mean:.2f} ± [\d.]+\*\*† \(n=2\)", overview(cells))
+    assert re.search(
+        rf"\| DPre \| {finished.seed}, 1000† \| {mean:.2f} ± [\d.]+† \| – \| 17.81 ± 0.33 \| 2.0e-07 ", details(cells)
+    )
 
 
 def test_a_cell_of_mixed_settings_is_refused(tmp_path):

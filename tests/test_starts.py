@@ -1,5 +1,7 @@
 """Returns on Reacher without the luck of their starts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import run_command
@@ -54,6 +56,17 @@ def test_the_adjustment_shifts_a_return_by_the_luck_of_its_start(trained):
     means = [adjusted_returns(run).mean() for run in runs]
     assert record["n"] == 2 and np.isclose(record["adjusted_mean"], np.mean(means))
     assert np.isclose(record["adjusted_se"], np.std(means, ddof=1) / 2**0.5)
+
+
+def test_seeds_that_diverged_are_left_out_and_counted(trained):
+    sound, other = trained[0]
+    failure = {"step": 500, "reason": "a parameter is not finite", "result": other.result}
+    runs = [sound, replace(other, result=None, failure=failure)]
+    table = adjusted_table(group_runs(runs)[0])
+    assert table.records[0]["n"] == 1 and table.records[0]["diverged"] == 1
+    assert " (1 of 2 diverged, left out)" in table.sections[0][0][2].lines[0]
+    table = adjusted_table(group_runs(runs[1:])[0])
+    assert table.sections[0][0][2].lines == ("– (1 of 1 diverged, left out)",) and table.records == []
 
 
 def test_gain_is_what_the_arm_can_make_up():

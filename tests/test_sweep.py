@@ -404,6 +404,7 @@ def test_status_of_a_folder(tmp_path, monkeypatch, capsys):
     root = tmp_path / "results"
     queued = CellFolders(root, "H+M", "SRad,steps=10", (0, 1, 2))
     queued.write("job", {"job": "7_0", "log": "x"})
+    queued.record("log").with_name("seed=0 (copy).log").touch()
     run_command(["algo=DPre", "env=R+N", "seed=3,5", *SHORT.split(), f"results={root}"])
     started = root / "R+N" / "DPre,steps=900" / "seed=4"
     started.mkdir(parents=True)

@@ -2,6 +2,7 @@
 
 import errno
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -36,6 +37,7 @@ class Scripted(gymnasium.Env):
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBS,), np.float64)
     made = 0
+    robot = SimpleNamespace(max_episode_steps=10)  # of which a progress bar asks this
 
     def __init__(self, fail=None):
         self.fail = fail  # called before every step
@@ -444,14 +446,16 @@ def test_statistics_stand_beside_each_evaluation_after_the_first_gradient_step(t
     for i in range(2):
         # No gradient step by step 20; one after each of the steps 26, 27, ... but the last.
         table = (folder(trainer, i) / "training.csv").read_text()
-        assert table == "step,count,double\n40,14.0,28.0\n50,24.0,48.0\n"
+        header, *rows = (line.split(",") for line in table.splitlines())
+        assert header == ["step", "count", "double", "suggested_violation", "suggested_infeasible"]
+        assert [row[:3] for row in rows] == [["40", "14.0", "28.0"], ["50", "24.0", "48.0"]]
         assert read_run(folder(trainer, i)).evaluations.step.tolist() == [20, 40, 50]
 
 
-def test_an_algorithm_without_statistics_leaves_no_table(tmp_path):
+def test_an_algorithm_without_statistics_has_those_of_its_suggestions(tmp_path):
     trainer = make_trainer(tmp_path)
     trainer.run()
-    assert not (folder(trainer) / "training.csv").exists()
+    assert list(read_run(folder(trainer)).training) == ["step", "suggested_violation", "suggested_infeasible"]
 
 
 def test_a_checkpoint_restores_every_counter_and_the_agent(tmp_path):

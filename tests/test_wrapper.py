@@ -373,6 +373,29 @@ def test_units_that_are_none_are_refused(low, high, said):
         InUnits(SpeedLimit(dim=1), low, high)
 
 
+def test_the_least_violating_action_of_an_empty_set_is_executed():
+    gap = LinearConstraint(
+        2, lambda obs: torch.tensor([[1.0, 0.0], [-1.0, 0.0]]), lambda obs: torch.full((2,), -0.3), on_empty="least"
+    )
+    for constraint in (gap, InUnits(gap, -1.0, 1.0)):
+        for mapping in (*MAPPINGS, None):
+            env = Constrained(Robot(), constraint, mapping)
+            env.reset()
+            if mapping is None:
+                with pytest.raises(InfeasibleActionError, match="by 0.8 .at most 0.300001 is allowed"):
+                    env.step(np.array([0.5, 0.5]))
+            suggested = np.array([0.0, 0.5]) if mapping is None else np.array([0.5, 0.5])
+            info = env.step(suggested)[4]
+            assert abs(info["executed_action"][0]) <= 1e-6
+            assert info["violation"] == pytest.approx(0.3 if mapping is None else 0.8)
+
+
+def test_what_is_no_constraint_is_refused():
+    for wrong in (Ball, None):
+        with pytest.raises(TypeError, match="the constraint is an object of a constraints.Constraint, got"):
+            Constrained(Robot(), wrong)
+
+
 def test_an_empty_set_is_reported_by_the_step():
     impossible = LinearConstraint(2, lambda obs: torch.ones(1, 2), lambda obs: torch.tensor([-3.0]))
     env = Constrained(Robot(), impossible)
@@ -386,23 +409,3 @@ def test_a_number_in_units_keeps_its_double_precision():
     constraint = InUnits(Ball(bound, 2), -1.0, 1.0)
     projected = constraint.project(torch.zeros(1), torch.tensor([1.0, 0.0], dtype=torch.float64))
     assert projected[0].item() == pytest.approx(bound**0.5, rel=1e-14)
-
-
-@pytest.mark.parametrize("mapping", ["project", "alpha", "gauge", None])
-def test_the_least_violation_is_executed_where_the_constraint_says_so(mapping):
-    def two_rows(obs):
-        return torch.tensor([[1.0, 0.0], [-1.0, 0.0]], dtype=torch.float64)
-
-    apart = LinearConstraint(2, two_rows, lambda obs: torch.full((2,), -0.5).double(), on_empty="least")
-    in_units = InUnits(
-        LinearConstraint(2, two_rows, lambda obs: torch.full((2,), -1.0).double(), on_empty="least"), -2, 2
-    )
-    for constraint in (apart, in_units):  # the same set: -0.5 >= a_1 >= 0.5
-        env = Constrained(Robot(), constraint, mapping)
-        env.reset()
-        info = env.step(np.array([0.0, 0.3]))[4]
-        assert info["executed_action"][0] == pytest.approx(0.0, abs=1e-6)
-        assert info["violation"] == pytest.approx(0.5)
-    if mapping is None:
-        with pytest.raises(InfeasibleActionError, match="at most 0.5"):
-            env.step(np.array([0.2, 0.3]))

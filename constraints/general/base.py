@@ -10,17 +10,18 @@ import torch
 from torch import Tensor
 
 from constraints.base import Constraint, ExplicitSet, OnEmpty
-from constraints.checks import ON_BOUNDARY, check_observation
+from constraints.checks import ON_BOUNDARY, check_each_alone, check_observation, check_tensor, checked
 from constraints.ellipse import ellipse_gauge_gradient
 from constraints.errors import ConstraintError, EmptySetError, name_samples, require
 from constraints.general.active_set import project_on_rows
-from constraints.general.centers import deep_points, guessed_points, interior_points, least_excess, widened
+from constraints.general.centers import deep_points, interior_points
+from constraints.general.depth import least_excess, widened
 from constraints.general.derivatives import projection_jacobian, with_derivatives
 from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.projection import closest_points, optimal_points
-from constraints.general.scaled_sets import ScaledSets, scale_sets
+from constraints.general.scaled_sets import ScaledSets, guessed_points, scale_sets
 from constraints.jacobian import JacobianProduct
-from constraints.numerics import is_traced, is_transformed, times
+from constraints.numerics import is_mapped, is_traced, is_transformed, times
 
 Result = TypeVar("Result")
 
@@ -64,11 +65,12 @@ class GeneralConstraint(Constraint):
         if on_empty not in ("error", "least"):
             raise ValueError(f"on_empty is {on_empty!r} (choices: 'error' 'least')")
         self.on_empty = on_empty
+        self._compared: set[str] = set()
 
     @torch.no_grad()
     def least_violation(self, obs: Tensor) -> Tensor:
         check_observation(obs)
-        at = self._coefficients(obs.double())
+        at = self.at(obs.double())
         sets = scale_sets(at.written, at.lead, check=False)
         # A row 0 <= b is violated by -b wherever one is.
         fixed = torch.where(sets.solid, 0.0, -sets.bounds).amax(-1)
@@ -77,6 +79,14 @@ class GeneralConstraint(Constraint):
     def _coefficients(self, obs: Tensor) -> At:
         """The coefficients at obs (..., n), checked."""
         raise NotImplementedError
+
+    def _values(self, function: Callable[[Tensor], Any], what: str, shape: tuple[int, ...], obs: Tensor) -> Tensor:
+        """The values of a function at obs (..., n), as `checked` returns them."""
+        values = checked(function(obs), what, shape, obs)
+        if what not in self._compared and obs.shape[:-1].numel() > 1 and not is_transformed():
+            self._compared.add(what)
+            check_each_alone(function, values, what, len(shape), obs)
+        return values
 
     def _part_gauges(self, at: At, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         """`_gauge_gradients`; a ConstraintError where the centre is not interior."""
@@ -88,7 +98,14 @@ class GeneralConstraint(Constraint):
 
     def at(self, at: At | Tensor) -> At:
         """The coefficients, whatever `_at` returned."""
-        return self._coefficients(at) if isinstance(at, Tensor) else at
+        if not isinstance(at, Tensor):
+            return at
+        if is_mapped():
+            raise RuntimeError(
+                f"{type(self).__name__} looks at values, which torch.func.vmap hides from all methods but project; they"
+                " take batches of any leading shape as they are"
+            )
+        return self._coefficients(at)
 
     def _check_center(self, at: At | Tensor, center: Tensor) -> None:
         pass  # in every call where it is used, below and in the subclasses
@@ -97,7 +114,7 @@ class GeneralConstraint(Constraint):
         if center is not None:
             inside = center.abs().amax(-1) < 1.0 - ON_BOUNDARY
             require(inside.flatten(), "the centre is not inside the box", name_samples(tuple(inside.shape)))
-            center = center.expand_as(direction)
+            center, direction = torch.broadcast_tensors(center, direction)
         return super()._gauge_and_gradient(at, direction, center)
 
     def _gauge_gradients(self, at: At | Tensor, direction: Tensor, center: Tensor | None) -> list[Tensor]:
@@ -216,6 +233,7 @@ class GeneralConstraint(Constraint):
 
 
 def check_obs(obs: Tensor) -> None:
-    """Raise a ConstraintError for a NaN or infinite observation."""
+    """Raise a ConstraintError for a NaN or infinite observation, a TypeError for no tensor."""
+    check_tensor("obs", obs)
     valid = obs.isfinite().all(-1)
     require(valid.flatten(), "the observation is NaN or infinite", name_samples(tuple(valid.shape)))

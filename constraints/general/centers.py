@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from constraints.errors import EmptySetError, require
 from constraints.general.active_set import project_on_rows
+from constraints.general.depth import deepest_on_rows, deepest_points
 from constraints.general.derivatives import with_derivatives
-from constraints.general.interior_point import solve_cone_programs
-from constraints.general.linear_programs import maximize_on_rows
-from constraints.general.scaled_sets import NO_INTERIOR, ScaledSets
+from constraints.general.projection import closest_points
+from constraints.general.scaled_sets import NO_INTERIOR, ScaledSets, guessed_points
 from constraints.numerics import times
 
 # The share of the largest radius that a centre keeps. A larger one leaves less room in which it moves continuously.
 _DEEP = 0.9
-# A guess less deep than this, or than half of the largest depth, gives way to the deepest point.
+# A guess less deep than this, or than half of the largest depth, gives way to a point that is nearly the deepest.
 _SHALLOW = 1e-2
-# The depth of the interior that `widened` gives to sets without one; single precision can tell it from 0.
-_ROOM = 5e-7
-# The rounding of the least violation, where that is large.
-_SHARE = 1e-12
-# The interior-point method's accuracy: deep enough below NO_INTERIOR to tell a thin set from a flat one.
-_ACCURACY = 1e-12
+# In a set that is nowhere deeper, too little room is left beside the deepest point.
+_THIN = 1e-7
 
 
 def deep_points(traced: ScaledSets) -> Tensor:
@@ -45,7 +39,7 @@ def deep_points(traced: ScaledSets) -> Tensor:
         # The radius changes with the slacks at the deepest point, by the multipliers of its rows.
         slack = traced.bounds - times(traced.rows, deepest[:, :-1])
         radius = radius + (weight * (slack - slack.detach())).sum(-1)
-    shrunk = replace(traced, bounds=traced.bounds - _DEEP * radius.unsqueeze(-1) * sets.solid)
+    shrunk = traced.inner(_DEEP * radius)
     target = torch.zeros_like(sets.rows[:, 0])
     bounds = shrunk.bounds.detach()
     center, multipliers = project_on_rows(sets.rows, bounds, target, sets.name, sets.given_rows)
@@ -55,120 +49,22 @@ def deep_points(traced: ScaledSets) -> Tensor:
     return with_derivatives(shrunk, target, center, flat, multipliers)
 
 
-def deepest_on_rows(sets: ScaledSets, box: bool = True) -> tuple[Tensor, Tensor]:
-    """The deepest point of each set and its depth, as the last coordinate (n, d + 1), and multipliers (n, m).
-
-    Ellipses are left out. The depth is the distance to the nearest row that is not 0, negative where there is no point
-    in all of them; without `box`, the box's rows do not bound the depth, but the point. The multipliers say how the
-    depth changes with the bounds.
-    """
-    m, d = sets.given_rows, sets.dim
-    solid = sets.solid
-    if not box:
-        solid = solid & sets.given
-    # Rows of unit norm again.
-    shrink = torch.where(solid, 0.5, 1.0).to(sets.rows).sqrt()
-    rows = torch.cat((sets.rows, solid.to(sets.rows).unsqueeze(-1)), -1) * shrink.unsqueeze(-1)
-    slope = torch.zeros_like(rows[:, 0])
-    slope[:, -1] = 1.0
-    # To begin with, the depth is held by one row, the tightest, and the faces of the box opposite to it.
-    reach = sets.rows.abs().sum(-1)
-    limit = torch.where(solid, (sets.bounds + reach) / (1.0 + reach), torch.inf)
-    first = limit[:, : m + 1].argmin(-1, keepdim=True)
-    towards = sets.rows.take_along_dim(first.unsqueeze(-1), 1).squeeze(1) >= 0.0
-    basis = torch.cat((first, m + torch.arange(d, device=first.device) + d * towards), -1)
-    solution, weight = maximize_on_rows(rows, sets.bounds * shrink, slope, basis, sets.name, m)
-    return solution, weight * shrink * solid
-
-
 def interior_points(sets: ScaledSets) -> Tensor:
-    """Interior points (n, d) of sets with ellipses: the guess where it is deep, the deepest point where it is outside.
-
-    In between it is a mean of the two, so that the centre does not jump where the guess leaves the set.
-    """
-    point = guessed_points(sets)
-    depth = sets.depth(point)
+    """Interior points (n, d) of sets with ellipses, continuous in these: the guess where it is deep, the point nearest
+    to it of those `_DEEP` times as deep as the deepest where it is outside, and a mean of the two in between."""
+    guess = guessed_points(sets)
+    depth = sets.depth(guess)
     shallow = (depth < _SHALLOW).nonzero().squeeze(-1)
-    if len(shallow) > 0:
-        part, depth = sets[shallow], depth[shallow]
-        deepest = deepest_points(part)
-        deep = (0.5 * part.depth(deepest)).clamp(max=_SHALLOW)
-        # The depth is concave, so that of a mean is at least the mean of the two, which is positive.
-        share = (0.5 - 0.5 * depth / deep).clamp(0.0, 1.0).unsqueeze(-1)
-        point = point.index_put((shallow,), torch.lerp(point[shallow], deepest, share))
-    return point
-
-
-def guessed_points(sets: ScaledSets) -> Tensor:
-    """Points (n, d) that are often interior: the centre of a single ellipse without rows, the origin otherwise."""
-    alone = sets.matrix.shape[1] == 1 and sets.given_rows == 0
-    return sets.center[:, 0] if alone else torch.zeros_like(sets.center[:, 0])
-
-
-def deepest_points(sets: ScaledSets) -> Tensor:
-    """Points (n, d) of the largest `depth`, of sets with ellipses; an EmptySetError where that is not positive."""
-    solution, converged = _deepest_in_cones(sets, box=True)
-    point = solution[:, :-1]
-    deep = sets.depth(point) > NO_INTERIOR
-    require(deep | converged, "the interior-point method failed", sets.name)
-    require(deep | (solution[:, -1] >= -NO_INTERIOR), "the set is empty", sets.name, EmptySetError)
-    require(deep, "the set has no interior", sets.name, EmptySetError)
-    return point
-
-
-def _deepest_in_cones(sets: ScaledSets, box: bool) -> tuple[Tensor, Tensor]:
-    """The deepest point of sets with ellipses and its depth (n, d + 1), and whether (n,) the method converged.
-
-    Without `box`, the box's rows do not bound the depth, but the point.
-    """
-    # Around the centre of the smallest ellipse, in its size.
-    traces = sets.matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
-    size = sets.inverse_size()
-    smallest = traces.argmax(-1)[:, None, None]
-    origin = sets.center.take_along_dim(smallest, 1).squeeze(1).clamp(-1.0, 1.0)
-    matrix, offset = sets.as_cones(origin, size)
-    # The last coordinate is the depth; a zero matrix does not bound it.
-    sink = torch.zeros_like(offset)
-    sink[..., 0] = 1.0 / (size * sets.root)
-    matrix = torch.cat((matrix, sink.unsqueeze(-1)), -1)
-    solid = sets.solid if box else sets.solid & sets.given
-    rows = torch.cat((sets.rows, solid.to(sets.rows).unsqueeze(-1)), -1)
-    bounds = size * (sets.bounds - times(sets.rows, origin))
-    gradient = torch.zeros_like(rows[:, 0])
-    gradient[:, -1] = 1.0
-    start = gradient * (size * sets.depth(origin).unsqueeze(-1)).clamp(max=0.0) - gradient
-    flat = torch.zeros_like(size)
-    solution, _, converged = solve_cone_programs(flat, gradient, rows, bounds, matrix, offset, start, _ACCURACY)
-    solution = solution / size
-    return torch.cat((origin + solution[:, :-1], solution[:, -1:]), -1), converged
-
-
-def least_excess(sets: ScaledSets) -> Tensor:
-    """The least (n,) by which points of the box leave rows and ellipses, negative where they are inside.
-
-    A row 0 <= b does not count. Where there is nothing else, it is -1.
-    """
-    sets = replace(sets, bounds=torch.where(sets.solid, sets.bounds, 1.0))
-    bounded = (sets.solid & sets.given).any(-1) | (sets.matrix.shape[1] > 0)
-    excess = torch.full_like(sets.bounds[:, 0], -1.0)
-    index = bounded.nonzero().squeeze(-1)
-    if len(index) > 0:
-        part = sets[index]
-        deepest = (_deepest_in_cones(part, False) if sets.curved else deepest_on_rows(part, False))[0]
-        excess[index] = -deepest[:, -1]
-    return excess
-
-
-def widened(sets: ScaledSets, flat: bool) -> ScaledSets:
-    """The sets with rows and ellipses, not the box, moved outwards by the same distance where they are empty.
-
-    With `flat`, also where they have no interior. The distance is the least with which a set has an interior of the
-    depth `_ROOM`: its points violate the constraint by no more than the least possible violation and `_ROOM`. A row
-    0 <= b < 0 is left out, as no action meets it.
-    """
-    excess = least_excess(sets)
-    growth = torch.where(excess > (-_ROOM if flat else NO_INTERIOR), excess * (1.0 + _SHARE) + _ROOM, 0.0)
-    growth = growth.unsqueeze(-1)
-    bounds = torch.where(sets.solid, sets.bounds, 1.0) + growth * sets.given
-    factor = (1.0 + growth / sets.root).square()
-    return replace(sets, bounds=bounds, matrix=sets.matrix / factor[..., None, None], root=sets.root + growth)
+    if len(shallow) == 0:
+        return guess
+    part, start, depth = sets[shallow], guess[shallow], depth[shallow]
+    inside = deepest_points(part)
+    largest = part.depth(inside)
+    wide = (largest > _THIN).nonzero().squeeze(-1)
+    if len(wide) > 0:
+        nearest = closest_points(part[wide].inner(_DEEP * largest[wide]), start[wide])[0]
+        inside = inside.index_put((wide,), nearest)
+    # The depth is concave, so that of a mean is at least the mean of the two, which is positive.
+    deep = (0.5 * largest).clamp(max=_SHALLOW)
+    share = (0.5 - 0.5 * depth / deep).clamp(0.0, 1.0).unsqueeze(-1)
+    return guess.index_put((shallow,), torch.lerp(start, inside, share))

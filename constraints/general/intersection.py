@@ -21,8 +21,10 @@ class Intersection(GeneralConstraint):
     Each is a constraint of this package, a user's own with `explicit`, or another intersection; ValueError for none, or
     for different dimensions. `penalty` is the sum of their penalties, `violation` the largest violation. `center` is
     that of a LinearConstraint if all are linear. With an ellipse it is the origin where that is interior, otherwise the
-    point deepest in the set, and a mean of both where the origin is near the boundary. Methods raise a ConstraintError
-    as those of LinearConstraint and QuadraticConstraint do.
+    point nearest to the origin of those at least 0.9 times as deep as the deepest, and a mean of both where the origin
+    is near the boundary. It is continuous in the coefficients. Methods raise a ConstraintError
+    as those of LinearConstraint and QuadraticConstraint do. The `on_empty` given here counts; those of the parts do
+    not, wherever a part or the whole is empty.
     """
 
     def __init__(self, *constraints: Constraint, on_empty: OnEmpty = "error"):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from constraints.base import ExplicitSet, OnEmpty
-from constraints.checks import ON_BOUNDARY, checked
+from constraints.checks import ON_BOUNDARY, check_function
 from constraints.errors import name_samples, require
 from constraints.general.base import At, GeneralConstraint, check_obs
 from constraints.general.scaled_sets import unit_rows
@@ -33,6 +33,9 @@ class LinearConstraint(GeneralConstraint):
         on_empty: OnEmpty = "error",
     ):
         super().__init__(dim, on_empty)
+        for what, function in (("A", A), ("b", b)):
+            if function is not None:
+                check_function(what, function)
         self._A, self._b = A, b
 
     def A(self, obs: Tensor) -> Tensor:
@@ -49,8 +52,8 @@ class LinearConstraint(GeneralConstraint):
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         check_obs(obs)
-        rows = checked(self.A(obs), "A(obs)", (-1, self.dim), obs)
-        bounds = checked(self.b(obs), "b(obs)", (rows.shape[-2],), obs)
+        rows = self._values(self.A, "A(obs)", (-1, self.dim), obs)
+        bounds = self._values(self.b, "b(obs)", (rows.shape[-2],), obs)
         return ExplicitSet(rows, bounds, [])
 
     def _coefficients(self, obs: Tensor) -> At:

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from constraints.errors import require
 from constraints.general.active_set import project_on_rows
-from constraints.general.centers import deepest_points, guessed_points
+from constraints.general.depth import deepest_points
 from constraints.general.interior_point import solve_cone_programs
-from constraints.general.scaled_sets import ScaledSets
+from constraints.general.scaled_sets import ScaledSets, guessed_points
 from constraints.numerics import one_where_zero, times
 
 # The interior-point method's accuracy. Its multipliers have to tell active constraints from others, no more.
@@ -145,8 +145,8 @@ def _newton(
         system = torch.cat((top, torch.cat((normals, -idle), -1)), 1)
         # Solved for the change of the multipliers: those of points far away are large, and so is their rounding.
         held = multipliers.gather(-1, slot) * used
-        stationary = target - point - times(normals.mT, held)
-        right = torch.cat((stationary, slack.gather(-1, slot) * used), -1)
+        rest = target - point - times(normals.mT, held)
+        right = torch.cat((rest, slack.gather(-1, slot) * used), -1)
         step = torch.linalg.solve_ex(system, right.unsqueeze(-1))[0].squeeze(-1)
         point = point + step[:, :d]
         multipliers = torch.zeros_like(multipliers).scatter(-1, slot, held + step[:, d:] * used)
@@ -155,7 +155,10 @@ def _newton(
             break
     feasible = sets.depth(point) >= -_OUTSIDE
     right_set = (active.sum(-1) <= d) & (multipliers >= 0.0).all(-1)
-    return point, multipliers, (moved <= _LAST_NEWTON_STEP) & feasible & right_set
+    # A singular system may have answered with a small step that solves nothing.
+    rest = (target - point - times(sets.slack(point)[1].mT, multipliers)).abs().amax(-1)
+    stationary = rest <= _LAST_NEWTON_STEP * (1.0 + target.abs().amax(-1))
+    return point, multipliers, (moved <= _LAST_NEWTON_STEP) & feasible & right_set & stationary
 
 
 def _sequential_programs(sets: ScaledSets, target: Tensor, point: Tensor, multipliers: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from constraints.base import Ellipse, ExplicitSet, OnEmpty
-from constraints.checks import ON_BOUNDARY, check_semidefinite, checked
+from constraints.checks import ON_BOUNDARY, check_function, check_semidefinite
 from constraints.ellipse import ellipse_excess, ellipse_gauge_gradient
 from constraints.errors import name_samples, require
 from constraints.general.base import At, GeneralConstraint, check_obs
@@ -21,11 +21,12 @@ class QuadraticConstraint(GeneralConstraint):
     """(a - c(obs))' Q(obs) (a - c(obs)) <= bound(obs) in the box [-1, 1]^dim, Q positive semi-definite, bound > 0.
 
     Pass Q, bound (a function or a number) and c (default: the origin), or override them in a subclass; TypeError where
-    Q or bound is missing. `center` is c, the point deepest in the set where c is not inside the box, and a mean of both
-    where c is near its boundary. Methods raise a ConstraintError that names the sample for NaN or infinite observations
-    or coefficients, wrong shapes, a Q that is not positive semi-definite, a bound that is not positive, and an empty
-    set. A set without interior is nowhere deeper than 1e-9: `center`, and methods that need one, raise for it,
-    `project` and `linear_oracle` only where it leaves no unique multipliers.
+    Q or bound is missing. `center` is c. Where c is not inside the box, it is the point nearest to c of those at least
+    0.9 times as deep in the set as the deepest; where c is near the box's boundary, a mean of both. It is continuous in
+    the coefficients. Methods raise a ConstraintError that names the sample for NaN or infinite observations or
+    coefficients, wrong shapes, a Q that is not positive semi-definite, a bound that is not positive, and an empty set.
+    A set without interior is nowhere deeper than 1e-9: `center`, and methods that need one, raise for it, `project` and
+    `linear_oracle` only where it leaves no unique multipliers.
     """
 
     def __init__(
@@ -37,6 +38,9 @@ class QuadraticConstraint(GeneralConstraint):
         on_empty: OnEmpty = "error",
     ):
         super().__init__(dim, on_empty)
+        for what, function in (("Q", Q), ("c", c)):
+            if function is not None:
+                check_function(what, function)
         self._Q, self._bound, self._c = Q, bound, c
 
     def Q(self, obs: Tensor) -> Tensor:
@@ -66,9 +70,9 @@ class QuadraticConstraint(GeneralConstraint):
     def _ellipse(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Q, c and the bound, checked."""
         check_obs(obs)
-        matrix = checked(self.Q(obs), "Q(obs)", (self.dim, self.dim), obs)
-        center = checked(self.c(obs), "c(obs)", (self.dim,), obs)
-        bound = checked(self.bound(obs), "bound(obs)", (), obs)
+        matrix = self._values(self.Q, "Q(obs)", (self.dim, self.dim), obs)
+        center = self._values(self.c, "c(obs)", (self.dim,), obs)
+        bound = self._values(self.bound, "bound(obs)", (), obs)
         least = check_semidefinite(matrix.detach(), "Q(obs)")
         matrix = 0.5 * (matrix + matrix.mT)
         matrix = matrix + (-least).clamp(min=0.0)[..., None, None] * torch.eye(

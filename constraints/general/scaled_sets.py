@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -72,6 +72,12 @@ class ScaledSets:
         """The sets without the graph of their coefficients."""
         matrix, center, root = self.matrix.detach(), self.center.detach(), self.root.detach()
         return ScaledSets(self.rows.detach(), self.bounds.detach(), matrix, center, root, self.name)
+
+    def inner(self, depth: Tensor) -> ScaledSets:
+        """The sets of the points that are at least this deep (n,), in the sense of `depth`."""
+        distance = depth.unsqueeze(-1)
+        matrix = self.matrix / (1.0 - distance / self.root).square()[..., None, None]
+        return replace(self, bounds=self.bounds - distance * self.solid, matrix=matrix, root=self.root - distance)
 
     def ellipse_values(self, point: Tensor) -> tuple[Tensor, Tensor]:
         """Values (n, k) of the ellipses at the point (n, d), inside where <= 1, and their gradients (n, k, d)."""
@@ -153,3 +159,9 @@ def unit_rows(rows: Tensor, bounds: Tensor) -> tuple[Tensor, Tensor]:
     for norm in (largest, one_where_zero((rows / largest.unsqueeze(-1)).norm(dim=-1))):
         rows, bounds = rows / norm.unsqueeze(-1), bounds / norm
     return rows, bounds.clamp(-1e150, 1e150)
+
+
+def guessed_points(sets: ScaledSets) -> Tensor:
+    """Points (n, d) that are often interior: the centre of a single ellipse without rows, the origin otherwise."""
+    alone = sets.matrix.shape[1] == 1 and sets.given_rows == 0
+    return sets.center[:, 0] if alone else torch.zeros_like(sets.center[:, 0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -21,22 +22,22 @@ class InUnits(GeneralConstraint):
     [low, high]. `low` and `high` are numbers or (d,), as of a `gymnasium.spaces.Box`; ValueError where they are not
     finite or low is not below high.
 
-    Violations and penalties are those of the rows and ellipses of a, each scaled as `Constraint.violation` says.
-    `on_empty` is that of `constraint`.
+    An empty set means what it means to `constraint` (`on_empty`). Violations and penalties are those of the rows and
+    ellipses of a, each scaled as `Constraint.violation` says.
     """
 
     def __init__(self, constraint: Constraint, low: ArrayLike, high: ArrayLike):
         super().__init__(constraint.dim, constraint.on_empty)
-        least, most = (torch.as_tensor(bound, dtype=torch.float64, device="cpu").reshape(-1) for bound in (low, high))
+        least, most = (np.asarray(bound, np.float64).reshape(-1) for bound in (low, high))
         if any(len(bound) not in (1, self.dim) for bound in (least, most)):
             raise ValueError(
                 f"low and high must be numbers or have {self.dim} values, got {len(least)} and {len(most)}"
             )
-        if not (least.isfinite().all() and most.isfinite().all() and (least < most).all()):
+        if not (np.isfinite(least).all() and np.isfinite(most).all() and (least < most).all()):
             raise ValueError(f"low must be below high, both finite, got {least.tolist()} and {most.tolist()}")
         self.constraint = constraint
-        self.middle = ((most + least) / 2.0).expand(self.dim)
-        self.half = ((most - least) / 2.0).expand(self.dim)
+        self.middle = np.broadcast_to((most + least) / 2.0, self.dim)
+        self.half = np.broadcast_to((most - least) / 2.0, self.dim)
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         return self._coefficients(obs).written
@@ -51,7 +52,7 @@ class InUnits(GeneralConstraint):
         return At(obs, list(at), lambda: written, (normalised, at))
 
     def _normalised(self, obs: Tensor) -> ExplicitSet:
-        middle, half = self.middle.to(obs.device), self.half.to(obs.device)
+        middle, half = obs.new_tensor(self.middle), obs.new_tensor(self.half)
         rows, bounds, ellipses = self.constraint.explicit(obs)
         scaled = [
             Ellipse(half.unsqueeze(-1) * ellipse.matrix * half, (ellipse.center - middle) / half, ellipse.bound)
@@ -73,6 +74,5 @@ class InUnits(GeneralConstraint):
 
 
 def _constant_ellipse(dim: int, ellipse: Ellipse) -> QuadraticConstraint:
-    bound = ellipse.bound
-    of_obs = (lambda _: bound) if isinstance(bound, Tensor) else bound
-    return QuadraticConstraint(dim, lambda _: ellipse.matrix, of_obs, lambda _: ellipse.center)
+    bound = torch.as_tensor(ellipse.bound, dtype=torch.float64, device=ellipse.matrix.device)
+    return QuadraticConstraint(dim, lambda _: ellipse.matrix, lambda _: bound, lambda _: ellipse.center)

@@ -65,7 +65,8 @@ def train(
 
     Prints each result and its folder. Returns whether every seed has a result.
     """
-    config, folders = on_this_machine(cell.config), dict(zip(cell.seeds, cell.folders, strict=True))
+    cell = replace(cell, config=on_this_machine(cell.config))
+    config, folders = cell.config, dict(zip(cell.seeds, cell.folders, strict=True))
     definition = definition or define(config.env, config.algo)
     torch.set_num_threads(int(config.threads))
     check_log(config.log)

@@ -154,6 +154,9 @@ class _Check:
     def _check_acting(self, agent: Agent) -> None:
         obs = torch.randn(len(SEEDS), OBS, generator=torch.Generator().manual_seed(0))
         which = [0, 2]
+        for begin in (agent.start_episode, agent.start_rollout):  # so that its memory is not zero
+            begin(range(len(SEEDS)))
+        agent.explore(obs, range(len(SEEDS)))
         before, remembered = _stream_states(agent), {name: rows[1].clone() for name, rows in agent.memory().items()}
         agent.start_episode(which)
         agent.start_rollout(which)

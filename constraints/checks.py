@@ -12,6 +12,8 @@ from constraints.errors import ConstraintError, name_samples, require
 
 ON_BOUNDARY = 1e-12
 """A centre that is nearer than this to the boundary is on it, up to rounding."""
+ROUNDING = 1e-7
+"""How far a centre in the box moves, at most, when it is rounded to float32."""
 _SAME = 1e-4
 """Values of a function in a batch and alone that differ by no more than this share are the same in float32."""
 # Asymmetry and negative eigenvalues of a matrix up to this share of its largest entry are rounding, in float32 too.

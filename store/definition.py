@@ -14,6 +14,7 @@ import hashlib
 import importlib
 import inspect
 import logging
+import os
 import re
 import sys
 import types
@@ -190,12 +191,8 @@ class _Describer:
             key = self._free(f"class {base.__qualname__}")
             self.found[key] = f"of {', '.join(parent.__qualname__ for parent in base.__bases__)}"
             self.found[_USER] = "yes"
-            generated = hasattr(base, "__dataclass_fields__") or hasattr(base, "_fields")
             for name, item in vars(base).items():
-                if isinstance(item, types.FunctionType):
-                    if not (generated and item.__code__.co_filename.startswith("<")):
-                        self.add(f"{key}.{name}", item)
-                elif not name.startswith(("__", "_abc_")) and not isinstance(item, types.MemberDescriptorType):
+                if not _is_made_by_python(base, name, item):
                     self.add(f"{key}.{name}", item)
 
     def _function(self, path: str, function: types.FunctionType) -> None:
@@ -247,11 +244,24 @@ def _is_library(item: Any) -> bool:
     return isinstance(item, kinds) and bound and not is_user(item) and not hasattr(item, "__wrapped__")
 
 
+def _is_made_by_python(kind: type, name: str, item: Any) -> bool:
+    """Whether a class has this only because it is a class, a dataclass, a named tuple or an Enum."""
+    private = ("_",) if issubclass(kind, Enum) or hasattr(kind, "_fields") else ("__", "_abc_")
+    if isinstance(item, types.FunctionType):
+        written = inspect.unwrap(item)
+        generated = hasattr(kind, "__dataclass_fields__") or hasattr(kind, "_fields")
+        own = is_user(written) and not (generated and written.__code__.co_filename.startswith(("<string", "<attrs")))
+        return name.startswith(private) and not own
+    return name.startswith(private) or isinstance(item, types.MemberDescriptorType)
+
+
 def _is_plain(value: Any) -> bool:
     return isinstance(value, _PLAIN) and not isinstance(value, (np.generic, Enum))
 
 
 def _plain(value: Any) -> str:
+    if isinstance(value, (str, PurePath)) and os.path.isabs(value) and os.path.isdir(value):
+        return "a folder"  # its name changes where code and data are moved
     if isinstance(value, PurePath):
         return value.name
     if isinstance(value, re.Pattern):

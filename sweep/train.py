@@ -63,7 +63,8 @@ def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Call
     `definition` is what `sweep.definition.define` says of the cell's task and algorithm.
     Prints each result and its folder. Returns whether every seed has a result.
     """
-    config, folders = on_this_machine(cell.config), dict(zip(cell.seeds, cell.folders, strict=True))
+    cell = replace(cell, config=on_this_machine(cell.config))
+    config, folders = cell.config, dict(zip(cell.seeds, cell.folders, strict=True))
     torch.set_num_threads(int(config.threads))
     check_log(config.log)
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU

@@ -363,3 +363,13 @@ def test_default_dtype_and_device_do_not_matter():
     for setting in ("double", "meta"):
         for value, expected in zip(values[setting], values["plain"], strict=True):
             torch.testing.assert_close(value, expected, rtol=0.0, atol=0.0)
+
+
+def test_the_own_centre_of_a_very_thin_set_is_inside():
+    constraint = WeightedL1(lambda obs: obs, 0.3, 2)
+    obs = torch.tensor([[-1e30, 1e-20], [1e30, 1e30], [1.0, 1.0]], dtype=torch.float64)
+    direction, center = torch.ones(3, 2, dtype=torch.float64), constraint.center(obs)
+    assert torch.isfinite(constraint.gauge(obs, direction, center)).all()
+    center[0, 0] = 0.01
+    with pytest.raises(ConstraintError, match="sample 0: the center is not inside the set"):
+        constraint.gauge(obs, direction, center)

@@ -335,6 +335,9 @@ def test_vmap_of_what_looks_at_values_says_so(name):
     for method in (constraint.center, constraint.least_violation):
         with pytest.raises(RuntimeError, match="looks at values, which torch.func.vmap hides"):
             torch.func.vmap(method)(obs)
+    for method in (constraint.center, lambda obs: constraint.alpha_map(obs, action[0])):
+        with pytest.raises(RuntimeError, match="the centre of .* has no torch.func transforms"):
+            torch.func.jacrev(method)(obs[0])
 
 
 @every_set

@@ -10,8 +10,10 @@ import subprocess
 import sys
 import types
 from collections import deque
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium
 import numpy as np
@@ -372,6 +374,38 @@ def test_a_description_is_the_same_in_every_process(tmp_path):
             found.append(json.loads(done.stdout))
     assert all(other == found[0] for other in found) and "0x" not in json.dumps(found[0])
     assert "class Barrier" in found[0] and found[0]["one.dim"] == "2"
+
+
+class Side(enum.IntEnum):
+    LEFT = 1
+
+
+@dataclass
+class Scaled:
+    factor: float = 2.0
+
+    def __call__(self, obs):
+        return times(obs, self.factor * Side.LEFT)
+
+
+class Pair(NamedTuple):
+    low: float
+
+
+def test_what_python_adds_to_a_class_does_not_count(tmp_path):
+    """It is another in each version of Python."""
+    found = describe({"value": Scaled(), "pair": Pair})
+    assert {key for key in found if "class" in key} == {
+        "class Scaled", "class Scaled.factor", "class Scaled.__call__", "class Side", "class Side.LEFT",
+        "class Side.LEFT.value", "class Pair", "class Pair.low", "class Pair.low.arguments",
+    } | {key for key in found if key.startswith("class Scaled.__call__.")}  # fmt: skip
+
+
+def test_the_folder_of_a_file_does_not_count(tmp_path):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    one, two = ({"value": [tmp_path / name, str(tmp_path / name)]} for name in "ab")
+    assert differences(describe(one), describe(two)) == ""
 
 
 def test_a_program_without_a_file(tmp_path):

@@ -308,7 +308,7 @@ def test_ctrl_c_checkpoints_all_and_the_same_command_goes_on_bit_by_bit(tmp_path
 
 
 def test_a_killed_process_and_a_diverging_seed_leave_the_others_alone(tmp_path):
-    words = f"algo=DPre,DRad env=R+L2 seed=3,5 {SHORT.replace('steps=300', 'steps=800')} learning_rate=1e30 jobs=2"
+    words = f"algo=DPre,DRad env=R+L2 seed=3,5 {SHORT.replace('steps=300', 'steps=800')} learning_rate=1e6 jobs=2"
     process = start(words, tmp_path)
     folder = next(
         e.cell for e in plan_of(words.replace(" jobs=2", ""), tmp_path) if e.cell.config.algo == "DRad"

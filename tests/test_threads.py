@@ -14,6 +14,7 @@ from helpers import CHECKPOINTED, Breaks, cells_of, config_of, train
 import sweep.train
 from core.config import THREADS
 from store.interrupt import Interrupted
+from sweep.cells import Cell
 from sweep.launch import launch
 from sweep.settings import parse_sweep
 
@@ -94,11 +95,11 @@ def test_the_launcher_chooses_for_the_cells_of_a_sweep(words, device, threads, g
 
 
 def test_a_run_that_resumes_on_another_device_says_so(tmp_path, capsys, monkeypatch):
-    saved = sweep.train.saved_settings
-    monkeypatch.setattr(sweep.train, "saved_settings", lambda config, seed: saved(config, seed) | {"device": "cuda"})
+    saved = Cell.settings
+    monkeypatch.setattr(Cell, "settings", lambda cell, seed: saved(cell, seed) | {"device": "cuda"})
     with pytest.raises(Interrupted):
         train(tmp_path, CHECKPOINTED, Breaks(40))
-    monkeypatch.setattr(sweep.train, "saved_settings", saved)
+    monkeypatch.setattr(Cell, "settings", saved)
     capsys.readouterr()
     assert train(tmp_path, f"{CHECKPOINTED} device=cpu")
     assert "(device=cpu now, cuda before: equal up to rounding to an unbroken run)" in capsys.readouterr().out

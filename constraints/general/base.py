@@ -21,7 +21,7 @@ from constraints.general.linear_programs import maximize_on_rows
 from constraints.general.projection import closest_points, optimal_points
 from constraints.general.scaled_sets import ScaledSets, guessed_points, scale_sets
 from constraints.jacobian import JacobianProduct
-from constraints.numerics import is_mapped, is_traced, is_transformed, times
+from constraints.numerics import is_mapped, is_traced, is_transformed, refuse_transforms, times
 
 Result = TypeVar("Result")
 
@@ -188,6 +188,7 @@ class GeneralConstraint(Constraint):
 
     def _center(self, at: At | Tensor) -> Tensor:
         at = self.at(at)
+        refuse_transforms(f"the centre of {type(self).__name__}")
 
         def solve(sets: ScaledSets) -> Tensor:
             if not sets.curved:

@@ -18,7 +18,7 @@ _DEEP = 0.9
 # A guess less deep than this, or than half of the largest depth, gives way to a point that is nearly the deepest.
 _SHALLOW = 1e-2
 # In a set that is nowhere deeper, too little room is left beside the deepest point.
-_THIN = 1e-7
+_THIN = 1e-6
 
 
 def deep_points(traced: ScaledSets) -> Tensor:

@@ -23,8 +23,8 @@ class Intersection(GeneralConstraint):
     that of a LinearConstraint if all are linear. With an ellipse it is the origin where that is interior, otherwise the
     point nearest to the origin of those at least 0.9 times as deep as the deepest, and a mean of both where the origin
     is near the boundary. It is continuous in the coefficients. Methods raise a ConstraintError
-    as those of LinearConstraint and QuadraticConstraint do. The `on_empty` given here counts; those of the parts do
-    not, wherever a part or the whole is empty.
+    as those of LinearConstraint and QuadraticConstraint do. `on_empty` decides for the whole; that of a part does
+    not count.
     """
 
     def __init__(self, *constraints: Constraint, on_empty: OnEmpty = "error"):

@@ -26,10 +26,16 @@ def load_plugins(words: Sequence[str]) -> list[str]:
     mine = [word for word in words if word.startswith(f"{KEY}=")]
     if len(mine) > 1:
         raise ConfigError(f"key {KEY!r} given twice: one {KEY}= takes several files, comma separated")
-    for text in mine[0].partition("=")[2].split(",") if mine else ():
-        if not text:
-            raise ConfigError(f"bad value {mine[0].partition('=')[2]!r} for {KEY}: expected Python files (.py)")
-        _load(Path(text).expanduser().absolute())
+    value = mine[0].partition("=")[2] if mine else ""
+    texts = value.split(",") if mine else []
+    if not all(texts):
+        raise ConfigError(f"bad value {value!r} for {KEY}: expected Python files (.py)")
+    paths = [Path(text).expanduser().absolute() for text in texts]
+    for path in paths:  # before any of them is imported
+        if not path.is_file() or path.suffix != ".py":
+            raise ConfigError(f"bad value {str(path)!r} for {KEY}: expected a Python file (.py)")
+    for path in paths:
+        _load(path)
     return [word for word in words if word not in mine]
 
 
@@ -45,8 +51,6 @@ def refuse_to_train_in_plugin() -> None:
 
 
 def _load(path: Path) -> None:
-    if not path.is_file() or path.suffix != ".py":
-        raise ConfigError(f"bad value {str(path)!r} for {KEY}: expected a Python file (.py)")
     if path in _loaded:
         return
     if _is_imported(path):

@@ -146,6 +146,7 @@ def test_a_plugin_without_a_name(tmp_path, monkeypatch, capsys, value):
     (tmp_path / "a.py").write_text("")
     assert run_command(["status", str(tmp_path), f"plugin={value}"]) == 2
     assert f"bad value {value!r} for plugin" in capsys.readouterr().err
+    assert not plugins.plugin_words()  # nothing was imported
 
 
 def test_a_name_is_registered_once_and_fits_on_a_command_line():

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's TD3 and SAC on the task of our benchmark, for comparison (`pip install .[bench]`)."""
+"""Stable-Baselines3's TD3 and SAC on the task of our benchmark, for comparison (`pip install -e '.[bench]'`)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """A pendulum whose speed a control barrier function limits, beside the same agent without it.
 
-    python bench/pendulum.py                        # needs Stable-Baselines3 (pip install .[bench])
+    python bench/pendulum.py                        # needs Stable-Baselines3 (pip install -e '.[bench]')
     python bench/pendulum.py steps=1000 out=here.png
 
 Trains SAC of Stable-Baselines3 for `steps` environment steps with and without `envs.Constrained`, and prints for both

@@ -8,7 +8,7 @@ TD3 is DPre (batch 100, layers of 400 and 300), SAC is SPre (batch 256, layers o
 
 - the floor: the matrix products of one update in the same shapes and nothing else (bench/floor.py);
 - if it is installed, Stable-Baselines3's algorithm of the same name with one seed and the same batch, layers and rate,
-  on the same environment, which projects (bench/peer.py; `pip install .[bench]`).
+  on the same environment, which projects (bench/peer.py; `pip install -e '.[bench]'`).
 
 All take turns of `steps` gradient steps, then of ten times as many environment steps, replay sampling included, with
 10,000 transitions a seed in the buffer. A round is a turn of each, and every other round has the reverse order. A ratio

@@ -76,7 +76,7 @@ def submit(sweep: Sweep, cells: Sequence[Cell]) -> None:
     try:
         import submitit
     except ImportError:
-        raise ConfigError("launcher=slurm needs submitit: pip install '.[slurm]', or pip install submitit") from None
+        raise ConfigError("launcher=slurm needs submitit: pip install -e '.[slurm]', or pip install submitit") from None
     folder = cells[0].root.absolute() / RECORDS / "slurm"
     folder.mkdir(parents=True, exist_ok=True)
     try:

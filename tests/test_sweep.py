@@ -511,7 +511,7 @@ def test_without_slurm_or_submitit_one_line_says_so(tmp_path, monkeypatch, capsy
     fake(tmp_path, monkeypatch, sbatch="exit 1")
     monkeypatch.setitem(sys.modules, "submitit", None)
     assert run_command(words) == 2
-    assert "pip install '.[slurm]'" in capsys.readouterr().err
+    assert "pip install -e '.[slurm]'" in capsys.readouterr().err
     assert not (tmp_path / "results").exists()
 
 

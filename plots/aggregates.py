@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from plots.grouping import DAGGER, Groups, count_diverged
+from plots.grouping import DAGGER, Groups, all_with, count_diverged, settings_without, shared_settings
 from plots.paper import order_algos
 from plots.statistics import (
     CONFIDENCE,
@@ -72,6 +72,7 @@ def aggregate(groups: Groups) -> list[Aggregates]:
 
 def mean_table(aggregates: Sequence[Aggregates]) -> Table:
     """Interquartile means. Each section has the algorithms with scores on the same tasks."""
+    shared = shared_settings(aggregate.settings for aggregate in aggregates)
     sections, records = [], []
     for aggregate in aggregates:
         for tasks, algos in comparable(aggregate.scores).items():
@@ -79,7 +80,7 @@ def mean_table(aggregates: Sequence[Aggregates]) -> Table:
             for algo in algos:
                 runs = sum(len(values) for values in aggregate.scores[algo].values())
                 value, low, high = (float(x) for x in aggregate.means[algo])
-                label = ", ".join(filter(None, (" ".join(tasks), aggregate.settings)))
+                label = ", ".join(filter(None, (" ".join(tasks), settings_without(aggregate.settings, shared))))
                 texts = (
                     label if not rows else "",
                     aggregate.label(algo),
@@ -92,6 +93,7 @@ def mean_table(aggregates: Sequence[Aggregates]) -> Table:
                 records.append(record | {"interquartile_mean": value, "low": low, "high": high})
             sections.append(rows)
     title = "Aggregate over tasks: interquartile mean of the scores (1: best mean of the paper's row, 0: return 0)"
+    title += all_with(shared)
     return Table("aggregate", title, ["Tasks", "Algorithm", "Runs", "IQM", INTERVAL], 2, sections, records)
 
 
@@ -99,11 +101,12 @@ def improvement_table(aggregates: Sequence[Aggregates]) -> Table:
     """The probability that the row's algorithm beats the column's, for each combination of settings."""
     aggregates = [aggregate for aggregate in aggregates if aggregate.improvements]
     algos = order_algos({algo for aggregate in aggregates for algo in aggregate.scores})
+    shared = shared_settings(aggregate.settings for aggregate in aggregates)
     sections, records = [], []
     for aggregate in aggregates:
         rows: list[list[TableCell]] = []
         for first in aggregate.scores:
-            cells = text_cells("" if rows else aggregate.settings, aggregate.label(first))
+            cells = text_cells("" if rows else settings_without(aggregate.settings, shared), aggregate.label(first))
             for second in algos:
                 estimate = aggregate.improvements.get((first, second))
                 if estimate is None:
@@ -118,7 +121,7 @@ def improvement_table(aggregates: Sequence[Aggregates]) -> Table:
         sections.append(rows)
     title = (
         "Probability of improvement: that a run of the row's algorithm is better than one of the column's, "
-        f"mean over their common tasks; bold where its {INTERVAL} is above 0.5"
+        f"mean over their common tasks; bold where its {INTERVAL} is above 0.5{all_with(shared)}"
     )
     return Table("improvement", title, ["Settings", "Algorithm", *algos], 2, sections, records)
 

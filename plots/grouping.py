@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, NamedTuple
@@ -25,7 +25,11 @@ class Condition(NamedTuple):
 
     @property
     def label(self) -> str:
-        return ", ".join(filter(None, self))
+        return self.label_without(())
+
+    def label_without(self, shared: Collection[str]) -> str:
+        """The label without the settings in `shared`."""
+        return ", ".join(filter(None, (self.task, settings_without(self.settings, shared))))
 
 
 DAGGER = "†"
@@ -93,14 +97,43 @@ def setting_text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"), default=str)
 
 
-def order_conditions(conditions: Iterable[Condition]) -> list[list[Condition]]:
-    """Sections of rows: the paper's own settings first, then one section for each other combination."""
+def order_conditions(cells: Mapping[Condition, Collection[str]]) -> list[list[Condition]]:
+    """Sections of rows, one for each combination of settings, in the order of `place_of_settings`.
+
+    `cells` has the algorithms of each row.
+    """
     by_settings: dict[str, list[str]] = defaultdict(list)
-    for task, settings in conditions:
+    count: Counter[str] = Counter()
+    for (task, settings), algos in cells.items():
         by_settings[settings].append(task)
-    return [
-        [Condition(task, settings) for task in order_tasks(tasks)] for settings, tasks in sorted(by_settings.items())
-    ]
+        count[settings] += len(algos)
+    ordered = sorted(by_settings, key=lambda settings: place_of_settings(settings, count[settings]))
+    return [[Condition(task, settings) for task in order_tasks(by_settings[settings])] for settings in ordered]
+
+
+def place_of_settings(settings: str, cells: int) -> tuple[int, int, str]:
+    """The key that sorts combinations of settings: fewest settings first, among those the one with most cells."""
+    return len(_split_settings(settings)), -cells, settings
+
+
+def shared_settings(combinations: Iterable[str]) -> list[str]:
+    """The settings that all of `combinations` have, sorted. A table says them once, in its title."""
+    sets = [set(_split_settings(settings)) for settings in combinations]
+    return sorted(set.intersection(*sets)) if sets else []
+
+
+def settings_without(settings: str, shared: Collection[str]) -> str:
+    """`settings` without those in `shared`."""
+    return ", ".join(setting for setting in _split_settings(settings) if setting not in shared)
+
+
+def all_with(shared: Sequence[str]) -> str:
+    """The end of the title of a table whose runs all have the settings in `shared`."""
+    return f"; all runs with {', '.join(shared)}" if shared else ""
+
+
+def _split_settings(settings: str) -> list[str]:
+    return settings.split(", ") if settings else []
 
 
 def final_return(run: Run) -> float | None:

@@ -10,10 +10,12 @@ from plots.grouping import (
     DAGGER,
     Condition,
     Groups,
+    all_with,
     count_diverged,
     count_failed,
     order_conditions,
     reward_statistics,
+    shared_settings,
 )
 from plots.paper import (
     DEFAULT_BATCH,
@@ -31,10 +33,10 @@ from store.folder import Run
 from tables import MISSING, Table, TableCell, text_cells
 
 
-def best_three(means: dict[str, float]) -> set[str]:
-    """The names with the three highest means, and any that ties with the third."""
+def best_of_row(means: dict[str, float]) -> set[str]:
+    """The names with the three highest means, or of three or fewer the one with the highest, and any that ties."""
     ranked = sorted(means.values(), reverse=True)
-    return {name for name, mean in means.items() if mean >= ranked[:3][-1]}
+    return {name for name, mean in means.items() if mean >= ranked[2 if len(ranked) > 3 else 0]}
 
 
 def decimals(values: Iterable[float]) -> int:
@@ -43,13 +45,14 @@ def decimals(values: Iterable[float]) -> int:
 
 
 def reward_table(groups: Groups, beside: bool = False) -> Table:
-    """The paper's table: mean and standard error, the best three bold, the number of seeds unless it is ten.
+    """The paper's table: mean and standard error, the best of a row bold, the number of seeds unless it is ten.
 
     It has the columns of the algorithms with results and, if `beside`, the paper's own columns beside them.
     """
     statistics, paper = reward_statistics(groups), read_paper() if beside else {}
     printed = {algo: stat for (*_, algo), stat in paper.items()}
     algos = _columns(statistics, printed)
+    shared = shared_settings(condition.settings for condition in statistics)
     ours = {algo for row in statistics.values() for algo in row}
     missing = TableCell((MISSING,), missing=True)
     sections, records = [], []
@@ -59,8 +62,8 @@ def reward_table(groups: Groups, beside: bool = False) -> Table:
             row = statistics[condition]
             theirs = {algo: paper.get((condition.task, _batch(condition), algo)) for algo in printed}
             digits = decimals(stat.mean for stat in (*row.values(), *theirs.values()) if stat)
-            best = best_three({algo: stat.mean for algo, stat in row.items()})
-            cells = [TableCell(tuple(condition.label.split(", ")))]
+            best = best_of_row({algo: stat.mean for algo, stat in row.items()})
+            cells = [TableCell(tuple(condition.label_without(shared).split(", ")))]
             for algo in algos:
                 same = same_without_constraint(algo) if condition.task == UNCONSTRAINED else None
                 if algo in row:
@@ -68,7 +71,7 @@ def reward_table(groups: Groups, beside: bool = False) -> Table:
                     cells.append(TableCell(_our_lines(row[algo], digits, runs), algo in best))
                     record = condition._asdict() | {"algo": algo} | row[algo]._asdict()
                     record |= {"failed": count_failed(runs), "diverged": count_diverged(runs)}
-                    record |= {"best_three": int(algo in best)}
+                    record |= {"bold": int(algo in best)}
                     if beside:
                         stat = theirs.get(algo)
                         record |= {"paper_mean": stat and stat.mean, "paper_se": stat and stat.se}
@@ -81,6 +84,7 @@ def reward_table(groups: Groups, beside: bool = False) -> Table:
             rows.append(cells)
         sections.append(rows)
     title = "Rewards: mean ± standard error over seeds (n where not ten), best three of a row bold"
+    title += f" (of three or fewer, the best){all_with(shared)}"
     header, spans = ["Condition"], {}
     for algo in algos:
         own = [algo] if algo in ours or not beside else []
@@ -88,6 +92,9 @@ def reward_table(groups: Groups, beside: bool = False) -> Table:
     for name, family in FAMILIES.items():
         if count := sum(unlabelled(head) in family for head in header):
             spans[name] = count
+    # The others stand last (order_algos). With no heading, they would seem to be of neither family.
+    if others := len(header) - 1 - sum(spans.values()):
+        spans["beyond the paper"] = others
     return Table("rewards", title, header, 1, sections, records, spans)
 
 
@@ -119,9 +126,11 @@ def _our_lines(stat: Statistic, digits: int, runs: Sequence[Run]) -> tuple[str, 
 def comparison_table(groups: Groups) -> Table:
     """Our results beside the paper's, where the paper has the cell. It is empty where it has none of them.
 
-    Only the batch size chooses the paper's row. Runs with other settings are compared too; the label has those.
+    Only the batch size chooses the paper's row. Runs with other settings are compared too; the label or the title has
+    those.
     """
     statistics, paper = reward_statistics(groups), read_paper()
+    shared = shared_settings(condition.settings for condition in statistics)
     sections, records = [], []
     for conditions in order_conditions(statistics):
         rows = []
@@ -132,7 +141,11 @@ def comparison_table(groups: Groups) -> Table:
                     paper.get((condition.task, _batch(condition), unlabelled(algo))),
                 )
                 digits = decimals((ours.mean, theirs.mean if theirs else ours.mean))
-                texts = [condition.label, algo, " ".join(_our_lines(ours, digits, groups[condition][algo]))]
+                texts = [
+                    condition.label_without(shared),
+                    algo,
+                    " ".join(_our_lines(ours, digits, groups[condition][algo])),
+                ]
                 record = condition._asdict() | {"algo": algo} | ours._asdict()
                 if theirs is None:
                     texts += [MISSING] * 3
@@ -149,6 +162,7 @@ def comparison_table(groups: Groups) -> Table:
         if rows:
             sections.append(rows)
     title = "Comparison with the paper; the difference also in joint standard errors, where there are several seeds"
+    title += all_with(shared)
     if all(record["paper_mean"] is None for record in records):
         sections, records = [], []
     header = ["Condition", "Algorithm", "Ours", "Paper", "Difference", "In joint s.e."]

@@ -10,6 +10,7 @@ the return and a smaller variance (a control variate with coefficient 1).
 from __future__ import annotations
 
 from functools import cache
+from itertools import chain
 
 import numpy as np
 from scipy.stats import qmc
@@ -17,7 +18,7 @@ from scipy.stats import qmc
 from core.random import stream_seed
 from envs import TASKS, make
 from envs.reacher import REACH, Reacher
-from plots.grouping import Groups, count_diverged, order_conditions, statistic
+from plots.grouping import Groups, all_with, count_diverged, order_conditions, shared_settings, statistic
 from plots.paper import order_algos
 from plots.rewards import describe
 from store.folder import Run
@@ -81,10 +82,13 @@ def is_on_reacher(run: Run) -> bool:
 
 
 def adjusted_table(groups: Groups) -> Table:
-    """Plain and adjusted returns of the cells on Reacher, over seeds, and how far a seed's 50 episodes scatter.
+    """Plain and adjusted returns of the cells on Reacher, over seeds, and how far a seed's final episodes scatter.
 
     Seeds that diverged are left out, as their starts are not known; a note says how many.
     """
+    rows_of = {condition for condition, by_algo in groups.items() if any(map(is_on_reacher, chain(*by_algo.values())))}
+    shared = shared_settings(condition.settings for condition in rows_of)
+    episodes: set[int] = set()
     sections, records = [], []
     for conditions in order_conditions(groups):
         rows = []
@@ -96,9 +100,12 @@ def adjusted_table(groups: Groups) -> Table:
                 runs = [run for run in on_reacher if "returns" in (run.result or {})]
                 if not runs:
                     if diverged:
-                        rows.append(text_cells(condition.label, algo, f"{MISSING}{note}", *[MISSING] * 3))
+                        rows.append(
+                            text_cells(condition.label_without(shared), algo, f"{MISSING}{note}", *[MISSING] * 3)
+                        )
                     continue
                 plain = [np.array(run.result["returns"]) for run in runs]
+                episodes |= {len(returns) for returns in plain}
                 adjusted = [adjusted_returns(run) for run in runs]
                 over_seeds = [statistic([float(values.mean()) for values in returns]) for returns in (plain, adjusted)]
                 of_a_seed = [
@@ -106,7 +113,7 @@ def adjusted_table(groups: Groups) -> Table:
                 ]
                 cells = [" ".join(describe(stat, 2)) for stat in over_seeds] + [f"{error:.2f}" for error in of_a_seed]
                 cells[0] += note
-                rows.append(text_cells(condition.label, algo, *cells))
+                rows.append(text_cells(condition.label_without(shared), algo, *cells))
                 names = ("mean", "se", "n", "adjusted_mean", "adjusted_se", "seed_se", "adjusted_seed_se")
                 values = (*over_seeds[0], *over_seeds[1][:2], *of_a_seed)
                 record = condition._asdict() | {"algo": algo} | dict(zip(names, values, strict=True))
@@ -114,5 +121,7 @@ def adjusted_table(groups: Groups) -> Table:
         if rows:
             sections.append(rows)
     title = "Reacher: returns as they are, and adjusted for the luck of their starts"
-    header = ["Condition", "Algorithm", "Return", "Adjusted", "s.e. of a seed", "adjusted"]
+    title += all_with(shared)
+    several = " or ".join(map(str, sorted(episodes))) or "final"
+    header = ["Condition", "Algorithm", "Return", "Adjusted", f"s.e. of {several} episodes", "the same, adjusted"]
     return Table("adjusted", title, header, 2, sections, records)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from plots.grouping import Groups, final_return
+from plots.grouping import Groups, final_return, place_of_settings
 from plots.paper import (
     DEFAULT_BATCH,
     UNCONSTRAINED,
@@ -65,7 +65,7 @@ def normalised_scores(groups: Groups) -> dict[str, Scores]:
         settings: {
             algo: {task: scores[algo][task] for task in order_tasks(scores[algo])} for algo in order_algos(scores)
         }
-        for settings, scores in sorted(by_settings.items())
+        for settings, scores in sorted(by_settings.items(), key=lambda item: place_of_settings(item[0], len(item[1])))
     }
 
 

@@ -271,11 +271,14 @@ def test_a_diverged_seed_is_not_averaged_away(tmp_path):
     assert math.isnan(mean[-1]) and np.isfinite(mean[:-1]).all()
 
 
-def test_best_three():
-    assert rewards.best_three({"a": 1.0, "b": 4.0, "c": 3.0, "d": 2.0}) == {"b", "c", "d"}
-    assert rewards.best_three({"a": -1.0, "b": -4.0, "c": -3.0, "d": -2.0}) == {"a", "d", "c"}
-    assert rewards.best_three({"a": 1.0, "b": 4.0, "c": 3.0, "d": 1.0}) == {"a", "b", "c", "d"}  # tied third
-    assert rewards.best_three({"a": 1.0, "b": 1.0}) == {"a", "b"}
+def test_best_of_a_row():
+    assert rewards.best_of_row({"a": 1.0, "b": 4.0, "c": 3.0, "d": 2.0}) == {"b", "c", "d"}
+    assert rewards.best_of_row({"a": -1.0, "b": -4.0, "c": -3.0, "d": -2.0}) == {"a", "d", "c"}
+    assert rewards.best_of_row({"a": 1.0, "b": 4.0, "c": 3.0, "d": 1.0}) == {"a", "b", "c", "d"}  # tied third
+    # All of three would be among the best three.
+    assert rewards.best_of_row({"a": 1.0, "b": 4.0, "c": 3.0}) == {"b"}
+    assert rewards.best_of_row({"a": 1.0, "b": 1.0}) == {"a", "b"}
+    assert rewards.best_of_row({"a": 1.0}) == {"a"}
 
 
 def test_the_papers_table_is_typed_right():
@@ -287,7 +290,7 @@ def test_the_papers_table_is_typed_right():
         row = {algo: stat for (t, b, algo), stat in table.items() if (t, b) == (task, batch)}
         assert sum(stat.mean for stat in row.values()) == pytest.approx(means, abs=1e-9)
         assert sum(stat.se for stat in row.values()) == pytest.approx(errors, abs=1e-9)
-        assert rewards.best_three({algo: stat.mean for algo, stat in row.items()}) == bold
+        assert rewards.best_of_row({algo: stat.mean for algo, stat in row.items()}) == bold
     assert table["R+L2", "default", "DPro"][:2] == (-4.65, 0.59)
     assert table["HC+O", "16", "SRad"][:2] == (7459, 169)
 
@@ -330,9 +333,9 @@ def test_reward_records(mixed):
     returns = [-5.0 + 0.1 * seed for seed in range(10)]
     assert float(dpro["mean"]) == pytest.approx(np.mean(returns))
     assert float(dpro["se"]) == pytest.approx(stats.sem(returns))
-    assert (dpro["n"], dpro["best_three"]) == ("10", "0")
-    assert (cells["R+L2", "", "SRad"]["n"], cells["R+L2", "", "SRad"]["best_three"]) == ("3", "1")
-    assert cells["R+L2", "", "Mine"]["best_three"] == "0"
+    assert (dpro["n"], dpro["bold"]) == ("10", "0")
+    assert (cells["R+L2", "", "SRad"]["n"], cells["R+L2", "", "SRad"]["bold"]) == ("3", "1")
+    assert cells["R+L2", "", "Mine"]["bold"] == "0"
     assert float(cells["W+M", "batch_size=16", "DRad"]["mean"]) == 4000
 
 
@@ -406,7 +409,11 @@ def test_latex(mixed):
     assert set(widths) == {11}
     assert r"\textbf{19.60}" in body and r"$\pm$ 0.06" in body and "$-$4.55" in body
     assert r"batch\_size=16" in body and "±" not in body and "–" not in body
-    assert r"\multicolumn{8}{c}{TD3 family} & \multicolumn{1}{c}{SAC family}" in text
+    assert (
+        r"\multicolumn{8}{c}{TD3 family} & \multicolumn{1}{c}{SAC family} & \multicolumn{1}{c}{beyond the paper}"
+        in text
+    )
+    assert r"\cmidrule(lr){10-10}\cmidrule(lr){11-11}" in text
 
 
 def test_figures(mixed):

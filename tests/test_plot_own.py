@@ -10,7 +10,7 @@ import plot
 from plots import aggregates, figures, style
 from plots.grouping import group_runs
 from plots.paper import COLORS
-from plots.rewards import reward_table
+from plots.rewards import comparison_table, reward_table
 from store.folder import read_results
 
 
@@ -78,7 +78,7 @@ def test_columns_are_those_with_results_and_the_papers_on_request(tmp_path, caps
     write_run(tmp_path, "R+L2", "SRad", 0, result=14.0, overrides={"batch_size": 16})
     groups = group_runs(read_results(tmp_path)[0])[0]
     table = reward_table(groups)
-    assert table.header == ["Condition", "SRad", "Mine"] and table.spans == {"SAC family": 1}
+    assert table.header == ["Condition", "SRad", "Mine"] and table.spans == {"SAC family": 1, "beyond the paper": 1}
     beside = reward_table(groups, beside=True)
     printed = [f"{algo} (paper)" for algo in COLORS]
     assert [head for head in beside.header if head.endswith("(paper)")] == printed
@@ -89,11 +89,48 @@ def test_columns_are_those_with_results_and_the_papers_on_request(tmp_path, caps
     assert values["SRad"].lines[0] == "15.00" and float(values["SRad (paper)"].lines[0]) > 0
     assert beside.header.index("SRad (paper)") == beside.header.index("SRad") + 1
     assert other[beside.header.index("SRad (paper)")].missing  # the paper has no such batch size on this task
-    assert sum(beside.spans.values()) == len(beside.header) - 2
+    assert sum(beside.spans.values()) == len(beside.header) - 1
     assert plot.main([str(tmp_path), "paper=beside", "format=md,tex,csv"]) == 0
     assert "SRad (paper)" in (tmp_path / "tables" / "rewards.md").read_text()
     capsys.readouterr()
     assert "unknown value of paper 'yes'" in refused_by_plot(capsys, tmp_path, "paper=yes")
+
+
+def test_settings_of_all_rows_are_in_the_title_and_other_rows_stand_below(tmp_path, capsys):
+    short = {"steps": 1500, "hidden": [32, 32]}
+    for seed in range(2):
+        for task in ("R+L2", "W+M"):
+            for algo in ("SRad", "DPre"):
+                write_run(tmp_path, task, algo, seed, result=15.0 + seed, overrides=short)
+        write_run(tmp_path, "R+L2", "Mine", seed, result=11.0 + seed, overrides=short | {"distance": 1.0})
+        for algo in ("SRad", "DPre", "Mine"):
+            write_run(tmp_path, "R+L2", algo, seed, result=12.0 + seed, overrides=short | {"tau": 0.1})
+    assert plot.main([str(tmp_path), "format=md,tex,csv"]) == 0
+    said = "; all runs with hidden=[32,32], steps=1500"
+    groups = group_runs(read_results(tmp_path)[0])[0]
+    sections = reward_table(groups).sections
+    labels = [[" ".join(row[0].lines) for row in rows] for rows in sections]
+    assert labels == [["R+L2", "W+M"], ["R+L2 tau=0.1"], ["R+L2 distance=1.0"]]
+    assert [rows[0][0].lines[0] for rows in comparison_table(groups).sections] == [
+        "R+L2",
+        "R+L2, tau=0.1",
+        "R+L2, distance=1.0",
+    ]
+    for name in ("rewards", "comparison", "adjusted", "aggregate", "improvement"):
+        for suffix in ("md", "tex"):
+            head, *body = (tmp_path / "tables" / f"{name}.{suffix}").read_text().splitlines()
+            # Only a reader with the title knows these settings.
+            assert head.endswith(said) and "steps" not in "".join(body), (name, suffix)
+    full = {record["settings"] for record in records(tmp_path, "rewards")}
+    plain = "hidden=[32,32], steps=1500"
+    assert full == {plain, f"distance=1.0, {plain}", f"{plain}, tau=0.1"}
+    settings = [record["settings"] for record in records(tmp_path, "aggregate")]
+    assert list(dict.fromkeys(settings)) == [plain, f"{plain}, tau=0.1", f"distance=1.0, {plain}"]
+    # A row with the paper's settings shares none, so every row keeps its own.
+    write_run(tmp_path, "R+N", "SRad", 0, result=15.0)
+    table = reward_table(group_runs(read_results(tmp_path)[0])[0])
+    assert "all runs with" not in table.title and table.sections[0][0][0].lines == ("R+N",)
+    assert table.sections[1][0][0].lines == ("R+L2", "hidden=[32,32]", "steps=1500")
 
 
 def test_settings_of_one_algorithm_stand_in_one_figure_with_the_default(tmp_path, drawn):

@@ -52,6 +52,7 @@ def test_the_adjustment_shifts_a_return_by_the_luck_of_its_start(trained):
         luck = gains(obs.astype(np.float64)) - mean_gain()
         assert np.allclose(np.array(run.result["returns"]) - adjusted_returns(run), luck, atol=1e-4)
     table = adjusted_table(group_runs(runs)[0])
+    assert table.header[-2:] == [f"s.e. of {len(runs[0].result['returns'])} episodes", "the same, adjusted"]
     (record,) = table.records
     means = [adjusted_returns(run).mean() for run in runs]
     assert record["n"] == 2 and np.isclose(record["adjusted_mean"], np.mean(means))

@@ -21,6 +21,7 @@ from core.config import Config, PenaltyConfig, keys_of, restore_settings
 from core.maps import Alpha, Gauge, Map, Placement, Project, Radial
 from core.words import ConfigError, NameTable, known_name
 from store.files import one_line
+from store.info import missing_plugin
 
 
 @dataclass(frozen=True)
@@ -146,9 +147,12 @@ def load_policy(folder: str | Path, which: str = "best") -> Policy:
     """
     folder = Path(folder).expanduser()
     settings = settings_of(folder)
-    known_name("algorithm", settings["algo"], ALGORITHMS)
+    try:
+        known_name("algorithm", settings["algo"], ALGORITHMS)
+        constraint, robot, obs_dim = parts_of(settings["env"])
+    except ConfigError as error:
+        raise ConfigError(f"{error}{missing_plugin(folder)}") from error
     config = replace(saved_config(settings), device="cpu")
-    constraint, robot, obs_dim = parts_of(config.env)
     algorithm = ALGORITHMS[config.algo]
     if changed := changes(folder, define(robot, constraint, algorithm)):
         warnings.warn(f"{folder} was trained on {changed}", stacklevel=2)

@@ -108,7 +108,11 @@ class Config:
     quick: bool = setting(False, "few evaluation episodes, to try something out; part of the run's name")
     # The run itself; none of these changes what is learned, beyond float rounding.
     results: str = setting("results", "folder that results go to")
-    overwrite: bool = setting(False, "start again in any case; the old run is kept")
+    overwrite: str = setting(
+        "false",
+        "true: start again in any case; changed: where the run is of another definition; old runs are kept",
+        Rule(lambda value: value in ("false", "true", "changed"), "must be false, true or changed"),
+    )
     simulator: str | None = setting(
         None, "simulator of the robot, where there is a choice (Reacher: closed-form, pybullet)"
     )

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 from store.definition import Description, differences, is_own
 from store.folder import Run, read_definition
+from store.info import read_info
 
 _UNKNOWN = "unknown"
 
@@ -31,14 +32,18 @@ def keep_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
             marks = {i: _mark((definitions[i] or {}).get(part)) for i in members}
             known = [i for i in members if marks[i] != _UNKNOWN]
             own = all(is_own(definitions[i][part]) for i in known)  # type: ignore[index]
-            kinds: dict[str, int] = {}
-            for i in known if own else members:
-                kinds.setdefault(marks[i], i)
+            kinds = {marks[i] for i in (known if own else members)}
             if len(kinds) < 2:
                 continue
             for i in members:
                 extra[i][f"{part}_definition"] = marks[i]
-            i, *others = kinds.values()
+            # The first run of each, in the order of their start.
+            members.sort(key=lambda i: str(read_info(runs[i].folder).get("started", "")))
+            firsts: dict[str, int] = {}
+            for i in members:
+                if marks[i] in kinds:
+                    firsts.setdefault(marks[i], i)
+            i, *others = firsts.values()
             for j in others:
                 one, other = definitions[i], definitions[j]
                 what = differences(one[part], other[part]) if one and other else "one of them is unknown"

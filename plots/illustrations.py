@@ -22,6 +22,7 @@ from core.words import ConfigError
 from plots.paper import order_tasks
 from plots.style import plain, save
 from store.folder import Run, find_runs, read_run
+from store.info import missing_plugin
 
 SET_COLOR, POINT_COLORS = "#cfe0f3", ("#b8520a", "#1e6b26")
 # Both are nearest to the same corner: the projection maps them to one point, with a gradient of zero.
@@ -107,7 +108,7 @@ def play(run: Run) -> Episode:
     shape.
     """
     if run.task not in envs.TASKS or run.algo not in ALGORITHMS:
-        raise ConfigError(f"{run.folder}: {run.algo} on {run.task} is not of this project")
+        raise ConfigError(f"{run.folder}: {run.algo} on {run.task} is not of this project{missing_plugin(run.folder)}")
     env = envs.make(run.task)
     try:
         obs_dim = env.observation_space.shape[0]
@@ -140,6 +141,8 @@ def draw_actions(folder: Path, out: Path, formats: Sequence[str]) -> list[Path]:
     except ValueError as error:
         raise ConfigError(str(error)) from error
     planar = [name for name, task in envs.TASKS.items() if task.constraint.dim == 2]
+    if run.task not in envs.TASKS:
+        raise ConfigError(f"{folder}: unknown task {run.task!r}{missing_plugin(folder)}")
     if run.task not in planar:
         raise ConfigError(
             f"{folder}: {run.task} is no task of two dimensions (choices: {', '.join(order_tasks(planar))})"

@@ -123,7 +123,7 @@ class Cell(CellFolders):
         config = self.config
         words = {"algo": config.algo, "env": config.env, "seed": format_seeds(self.seeds)}
         words |= parse_variant(self.full_variant)[1]
-        words |= {"results": str(self.root.absolute()), "overwrite": json.dumps(config.overwrite)}
+        words |= {"results": str(self.root.absolute()), "overwrite": config.overwrite}
         words |= {"device": config.device, "threads": str(config.threads)}
         words |= {"checkpoint_every": str(config.checkpoint_every), "log": config.log}
         if config.simulator is not None:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from typing import NoReturn
 
 from algos import ALGORITHMS, definition
 from algos.definition import changes
 from core.words import ConfigError
 from envs import TASKS
-from store.checkpoint import saved_step
+from store.checkpoint import CheckpointFolder
 from store.definition import Description, is_own
 from store.folder import has_ended, read_definition
 from sweep.cells import Cell
@@ -21,27 +22,35 @@ def define(task: str, algo: str) -> dict[str, Description]:
     return definition.define(TASKS[task].robot, TASKS[task].constraint, ALGORITHMS[algo])
 
 
-def check_definitions(cells: Sequence[Cell]) -> None:
-    """Raise ConfigError if a run of `cells` that has ended, or can resume, was trained on another definition."""
+def find_changed(cells: Sequence[Cell]) -> dict[Path, str]:
+    """The runs of `cells` that were trained on another definition, as `changed_runs` finds them."""
     defined = cache(define)
+    found: dict[Path, str] = {}
     for cell in cells:
-        if not cell.config.overwrite:
-            for folder in cell.folders:
-                if has_ended(folder) or saved_step(folder):
-                    check_definition(folder, defined(cell.config.env, cell.config.algo))
+        found |= changed_runs(cell.folders, defined(cell.config.env, cell.config.algo))
+    return found
 
 
-def check_definition(folder: Path, now: Mapping[str, Description]) -> None:
-    """Raise ConfigError if the run in `folder` was trained on another definition than `now`.
+def changed_runs(folders: Iterable[Path], now: Mapping[str, Description]) -> dict[Path, str]:
+    """The runs in `folders` that were trained on another definition than `now`, each with what a message says of it.
 
-    Runs of the project's own tasks and algorithms may be older than definitions.
+    Only runs that have ended or have a checkpoint count: others start again in any case. Runs of the project's own
+    tasks and algorithms may be older than definitions.
     """
-    way_out = "overwrite=true starts it again and keeps the old one"
-    if read_definition(folder) is None:
-        if not all(map(is_own, now.values())):
-            raise ConfigError(
-                f"{folder} does not tell on which definition of its task and algorithm it was trained; {way_out}"
-            )
-        return
-    if changed := changes(folder, now):
-        raise ConfigError(f"{folder} was trained on {changed}; {way_out}")
+    found = {}
+    for folder in folders:
+        if not has_ended(folder) and not CheckpointFolder(folder).folder.exists():
+            continue
+        if read_definition(folder) is None:
+            if not all(map(is_own, now.values())):
+                found[folder] = "does not tell on which definition of its task and algorithm it was trained"
+        elif changed := changes(folder, now):
+            found[folder] = f"was trained on {changed}"
+    return found
+
+
+def refuse(changed: Mapping[Path, str]) -> NoReturn:
+    """Raise the ConfigError of a command that has such runs, `changed`, and does not say what becomes of them."""
+    (folder, said), *others = changed.items()
+    more = f" (so it is for {len(others)} more)" if others else ""
+    raise ConfigError(f"{folder} {said}{more}; overwrite=changed starts such runs again and keeps the old ones")

@@ -11,7 +11,7 @@ from core.config import AUTO
 from core.words import ConfigError
 from store.folder import LONGEST_NAME
 from sweep.cells import Cell, format_seeds
-from sweep.definition import check_definitions
+from sweep.definition import find_changed, refuse
 from sweep.exit import Exit
 from sweep.local import run_queue
 from sweep.plan import describe_plan, make_plan, memory_warning
@@ -33,13 +33,13 @@ def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None
         device = "cuda" if asks_for_gpus(sweep) else "cpu"
         cells = [Cell.of(replace(cell.config, device=device)) for cell in cells]
     cells = [Cell.of(on_this_machine(cell.config, threads)) for cell in cells]
-    settings = cells[0].config  # one command has one device, and overwrites all cells or none
+    settings = cells[0].config  # one command has one device and one overwrite=
     check_log(settings.log)  # jobs of Slurm have the same Python and home
     if not on_slurm:
         check_device(settings.device)
         for task, simulator in {(cell.task, cell.config.simulator) for cell in cells if cell.config.simulator}:
             make_env(task, simulator).close()  # where it is not installed, no cell should start
-    elif settings.overwrite:
+    elif settings.overwrite == "true":
         raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
     else:
         check_gpus(sweep, settings.device)
@@ -49,7 +49,8 @@ def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None
                 f"seed={format_seeds(cell.seeds)} is too long for the name of a log: take seeds without gaps, or"
                 " several commands"
             )
-    check_definitions(cells)
+    if settings.overwrite == "false" and (changed := find_changed(cells)):
+        refuse(changed)
     entries = make_plan(cells, job_states(cells))
     if sweep.settings.dry:
         print(describe_plan(entries, jobs))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from store.folder import read_results
 from sweep import estimates
 from sweep.cells import Cell, format_seeds, shorten
+from sweep.definition import find_changed
 from sweep.states import CellState, Stage, count_states, list_details, reached, state_of
 from tables import Table, text_cells, to_terminal
 
@@ -50,11 +51,13 @@ def make_plan(cells: Sequence[Cell], jobs: Mapping[str, str]) -> list[Entry]:
     """The plan of `cells`; `jobs` as `state_of` takes them."""
     first = cells[0].config
     runs, _ = read_results(cells[0].root, {c.config.env for c in cells}, {c.config.algo for c in cells})
-    factors = estimates.corrections(runs, first.device)  # one command has one device
+    factors = estimates.corrections(runs, first.device)  # one command has one device and one overwrite=
+    changed = find_changed(cells) if first.overwrite == "changed" else {}
     entries = []
     for cell in cells:
         state = state_of(cell, jobs)
-        if cell.config.overwrite and not state.stage.taken:
+        again = first.overwrite == "true" or any(folder in changed for folder in cell.folders)
+        if again and not state.stage.taken:
             state = CellState(Stage.NEW, detail="starts again")
         name = cell.config.env, cell.config.algo
         timed = name in factors or estimates.is_measured(*name)

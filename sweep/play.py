@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -31,7 +33,11 @@ def play(words: Sequence[str], stop_if_asked: Callable[[], None] = lambda: None)
     settings = parse_words(words[1:], ("episodes", "which", "video"))
     episodes = whole_number("episodes", settings.get("episodes", "3"))
     video = Path(settings["video"]).expanduser() if "video" in settings else None
-    policy = load_policy(words[0], settings.get("which", "best"))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        policy = load_policy(words[0], settings.get("which", "best"))
+    for warning in caught:
+        print(f"note: {warning.message}", file=sys.stderr)
     with closing(_make_env(policy, filmed=video is not None)) as env:
         if video is None:
             _play_episodes(env, policy, episodes, stop_if_asked)

@@ -46,7 +46,7 @@ class Display:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for bar in self.bars:
+        for bar in reversed(self.bars):  # the first is the only one that leaves the cursor at the start of its line
             bar.close()
 
     def say(self, line: str) -> None:
@@ -72,7 +72,7 @@ class Display:
             return
         self.next_look = time.monotonic() + INTERVALS[0 if self.terminal else 1]
         shares = {entry: entry.progress() for entry in running}
-        line = f"{len(self.done)} of {len(self.entries)} cells done, {len(running)} running"
+        line = f"{self._done()}, {len(running)} running"
         if self.failed:
             line += f", {len(self.failed)} failed"
         line += f", ETA {in_words(self._eta(running, shares))}"
@@ -101,10 +101,13 @@ class Display:
         waiting = [entry.remaining for entry in self.entries if entry not in over]
         return makespan([pace * seconds for seconds in (*left.values(), *waiting)], self.jobs)
 
+    def _done(self) -> str:
+        return f"{len(self.done)} of {len(self.entries)} cell{'s' * (len(self.entries) != 1)} done"
+
     def summary(self) -> str:
         """The last line."""
         open_cells = len(self.entries) - len(self.done) - len(self.failed)
-        parts = [f"{len(self.done)} of {len(self.entries)} cells done"]
+        parts = [self._done()]
         parts += [f"{len(self.diverged)} of them with a seed that diverged"] if self.diverged else []
         parts += [f"{len(self.failed)} failed"] if self.failed else []
         parts += [f"{open_cells} not done"] if open_cells else []

@@ -28,7 +28,7 @@ from store.output import forgiving_output
 from store.provenance import command_line, describe_environment
 from sweep.cells import Cell, make_cells
 from sweep.check import check_training
-from sweep.definition import check_definition, define
+from sweep.definition import changed_runs, define, refuse
 from sweep.exit import Exit, stoppable
 from sweep.plugins import load_plugins, refuse_to_train_in_plugin
 
@@ -81,13 +81,16 @@ def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Call
     with ExitStack() as locks:
         for folder in folders.values():
             locks.enter_context(run_lock(folder))
-        ended = {seed for seed, folder in folders.items() if has_ended(folder) and not config.overwrite}
-        for folder in folders.values():
-            if not config.overwrite and (has_ended(folder) or CheckpointFolder(folder).folder.exists()):
-                check_definition(folder, definition)
+        changed = changed_runs(folders.values(), definition)
+        if changed and config.overwrite == "false":
+            refuse(changed)
+        again = {s for s, folder in folders.items() if config.overwrite == "true" or folder in changed}
+        kept = {seed: folder for seed, folder in folders.items() if seed not in again}
+        ended = {seed for seed, folder in kept.items() if has_ended(folder)}
         for seed in sorted(ended):
             print(f"{folders[seed]}: {_end_of(folders[seed])} (overwrite=true starts it again and keeps this one)")
-        groups, fresh = ([], list(folders)) if config.overwrite else _find_checkpoints(folders, ended)
+        groups, fresh = _find_checkpoints(kept, ended)
+        fresh = sorted({*fresh, *again})
         info = describe_environment(sys.orig_argv[1:])
         info |= {"cell": command_line(cell.words), "threads": config.threads, "device": _device_name(config.device)}
         for group in groups:
@@ -104,7 +107,7 @@ def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Call
                     cell.settings(seed),
                     info,
                     config.eval_episodes,
-                    replace_finished=config.overwrite,
+                    replace_finished=seed in again,
                     definition=definition,
                 )
                 for seed in fresh

@@ -470,7 +470,8 @@ def test_a_finished_run_of_another_definition_is_not_taken_for_this_one(tmp_path
     capsys.readouterr()
     assert run_command(command(tmp_path, *more)) == 2
     err = capsys.readouterr().err
-    assert err.count("\n") == 1 and "the constraint's bound: 0.05 then, 0.9 now; overwrite=true" in err
+    assert err.count("\n") == 1 and "the constraint's bound: 0.05 then, 0.9 now" in err
+    assert "(so it is for 1 more); overwrite=changed starts such runs again" in err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
     if not more:
         assert run_command(command(tmp_path, "overwrite=true")) == 0

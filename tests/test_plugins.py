@@ -71,7 +71,7 @@ def test_the_processes_of_a_sweep_load_them(plugin, tmp_path):
     words = [*CELL.replace("seed=0", "seed=0,1").split(), f"results={root}", f"plugin={plugin}", "jobs=1"]
     done = python("run.py", *words)
     assert done.returncode == 0, done.stderr
-    assert "1 of 1 cells done" in done.stdout and len(find_runs(root)) == 2
+    assert "1 of 1 cell done" in done.stdout and len(find_runs(root)) == 2
     (tmp_path / "my_bounds.py").write_text("BOUND = 0.9\n")
     done = python("run.py", *words)
     assert done.returncode == 2 and "the constraint's bound: 0.05 then, 0.9 now" in done.stderr

@@ -336,7 +336,7 @@ def test_cells_that_others_have_are_left_out(tmp_path, monkeypatch, capsys):
     for more in ([], ["overwrite=true"]):
         assert run_command([*words, *more]) == 2
         captured = capsys.readouterr()
-        assert "1 of 1 cells done" in captured.out and "failed" not in captured.err
+        assert "1 of 1 cell done" in captured.out and "failed" not in captured.err
         (line,) = [line for line in captured.err.splitlines() if "skipped" in line]
         assert line.startswith("2 cells skipped because another process or job trains them")
         assert "is queued: job 7" in line or "on elsewhere" in line

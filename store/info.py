@@ -1,0 +1,28 @@
+"""What info.json of a run tells a reader: when the run started, and on which files of the user's own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+
+def read_info(folder: str | Path) -> dict[str, Any]:
+    """The content of info.json in the folder of a run; empty if it cannot be read."""
+    try:
+        content = json.loads(Path(folder, "info.json").read_text())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def missing_plugin(folder: str | Path) -> str:
+    """The end of a message that does not know the algorithm or the task of a run: the files that may define it.
+
+    Empty where the run used no file of the user's own.
+    """
+    try:
+        names = ",".join(source["file"] for source in read_info(folder).get("sources", []))
+    except (KeyError, TypeError):
+        return ""
+    return f"; its run used {names}: add plugin={names}" if names else ""

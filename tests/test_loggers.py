@@ -98,7 +98,7 @@ def test_a_run_that_resumes_continues_the_same_page_without_a_step_twice(tmp_pat
 def test_weights_and_biases_offline_keeps_one_run_over_resumptions(tmp_path):
     """In a process of its own, as Weights & Biases starts others."""
     code = f"""
-import sys
+import sys, time
 sys.path.insert(0, {str(ROOT / "tests")!r})
 from pathlib import Path
 from helpers import train
@@ -107,6 +107,7 @@ root, words = Path({str(tmp_path)!r}), "algo=DRad " + WORDS + " seed=3,5 log=wan
 try:
     train(root, words, Crash(root, 50))
 except ZeroDivisionError:
+    time.sleep(1.5)  # the names of Weights & Biases' folders have seconds
     train(root, words)
 """
     environment = os.environ | {"WANDB_MODE": "offline", "PYTHONPATH": str(ROOT)}

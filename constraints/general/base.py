@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any, TypeVar
@@ -76,9 +77,9 @@ class GeneralConstraint(Constraint):
         fixed = torch.where(sets.solid, 0.0, -sets.bounds).amax(-1)
         return torch.maximum(least_excess(sets), fixed).clamp(min=0.0).view(at.lead).to(obs)
 
+    @abstractmethod
     def _coefficients(self, obs: Tensor) -> At:
         """The coefficients at obs (..., n), checked."""
-        raise NotImplementedError
 
     def _values(self, function: Callable[[Tensor], Any], what: str, shape: tuple[int, ...], obs: Tensor) -> Tensor:
         """The values of a function at obs (..., n), as `checked` returns them."""
@@ -88,9 +89,9 @@ class GeneralConstraint(Constraint):
             check_each_alone(function, values, what, len(shape), obs)
         return values
 
+    @abstractmethod
     def _part_gauges(self, at: At, direction: Tensor, center: Tensor | None) -> list[Tensor]:
         """`_gauge_gradients`; a ConstraintError where the centre is not interior."""
-        raise NotImplementedError
 
     def _at(self, obs: Tensor) -> At | Tensor:
         # Transforms of torch.func see the solvers from outside, as one function of the observation.

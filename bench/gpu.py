@@ -10,7 +10,8 @@ The parts come in this order, and each result is saved as soon as it is there, s
 - `updates`: gradient steps of TD3 (DPre) and SAC (SPre), sampling included, of 1, 10 and 30 seeds in lockstep on R+L2
   and HC+O, beside the floor (the same matrix products and nothing else, as a CUDA graph) and, for one seed, beside
   eager PyTorch in CleanRL's style (bench/eager.py); CPU time of the thread that launches them; GPU memory;
-- `agreement`: how far parameters on the GPU are from those on the CPU over the first 200 updates, all 13 algorithms;
+- `agreement`: how far parameters on the GPU are from those on the CPU over the first 200 updates, all 13 algorithms,
+  beside what one rounding of the first parameters makes on the CPU;
 - `runs`: steps a second of whole runs, environment included, and where the time of a step of all seeds goes;
 - `cells`: full-length cells of R+L2, the algorithms `cells` with the seeds `cell_seeds`, a process each, until the time
   is over. Their folders are in `out`/runs, without checkpoints while they run; the same command resumes those that the
@@ -157,9 +158,17 @@ def agreement_table(records: Sequence[dict]) -> Table:
     by_name: dict[str, list[dict]] = {}
     for r in records:
         by_name.setdefault(r["algo"], []).append(r)
-    rows = [text_cells(name, *(f"{r['difference']:.1e}" for r in found)) for name, found in by_name.items()]
+    rows = [
+        text_cells(
+            name,
+            *(f"{r['difference']:.1e}" for r in found),
+            *(f"{r['rounding']:.1e}" for r in found if r["steps"] == counts[-1]),
+        )
+        for name, found in by_name.items()
+    ]
     title = f"Largest relative difference to the CPU's parameters after so many updates, {records[0]['task']}"
-    return Table("agreement", title, ["", *map(str, counts)], 1, [rows], list(records))
+    header = ["", *map(str, counts), f"{counts[-1]}, CPU with another rounding"]
+    return Table("agreement", title, header, 1, [rows], list(records))
 
 
 def runs_table(records: Sequence[dict]) -> Table:

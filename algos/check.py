@@ -163,6 +163,8 @@ class _Check:
         suggested = agent.explore(obs, which)
         if suggested.shape != (len(SEEDS), DIM):
             self._fail(f"explore() returns shape {tuple(suggested.shape)}, expected (seeds, d)")
+        if suggested.dtype != torch.float32:
+            self._fail(f"explore() returns {suggested.dtype}, expected torch.float32")
         agent.warm_up(which)
         if any(not torch.equal(state[1], _stream_states(agent)[name][1]) for name, state in before.items()):
             self._fail(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -137,7 +138,6 @@ class SAC(Agent):
         self.actor_optimizer = Adam(self.actor.parameters(), config.learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), config.learning_rate)
         self.temperature_optimizer = Adam(self.temperature.parameters(), config.learning_rate)
-        self.explored = Captured(self.noisy_suggestion)
         self.target_entropy = -float(self.action_dim)
         self.rollout_noise = torch.zeros(seeds, *self.actor.noise_shape, device=self.device)
         self.entropy = torch.zeros(seeds, 1, device=self.device)  # of the policy at the last batch's states
@@ -174,6 +174,11 @@ class SAC(Agent):
         else:
             noise = self.exploration.normal(*self.actor.noise_shape, which=which).unsqueeze(1)
         return self.explored(obs, noise)
+
+    @cached_property
+    def explored(self) -> Captured:
+        """`noisy_suggestion`, a CUDA graph on a GPU."""
+        return Captured(self.noisy_suggestion, self.device)
 
     def noisy_suggestion(self, obs: Tensor, noise: Tensor) -> Tensor:
         """A sample of the policy at obs (seeds, n), before the map; `noise` as in the actor's `sample`."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -67,7 +68,6 @@ class TD3(Agent):
         self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
         self.actor_optimizer = Adam(self.actor.parameters(), learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), learning_rate)
-        self.explored = Captured(self.noisy_suggestion)
         # Measures of the last step of each kind, a row a seed.
         self.measures = {name: torch.zeros(len(self.seeds), device=self.device) for name in MEASURES}
 
@@ -98,6 +98,11 @@ class TD3(Agent):
 
     def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
         return self.explored(obs, self.exploration.normal(self.action_dim, which=which))
+
+    @cached_property
+    def explored(self) -> Captured:
+        """`noisy_suggestion`, a CUDA graph on a GPU."""
+        return Captured(self.noisy_suggestion, self.device)
 
     def noisy_suggestion(self, obs: Tensor, noise: Tensor) -> Tensor:
         """mu(s) plus exploration noise, for obs (seeds, n) and standard normal `noise` (seeds, d)."""

@@ -39,15 +39,13 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,6 +60,7 @@ import torch
 from algos import PAPER
 from bench.common import machine_name
 from bench.lockstep import ALGO, PHASES, measure_agreement, measure_run, measure_updates
+from bench.mps import shared_gpu
 from core.config import parse_seeds
 from core.words import ConfigError, parse_words, split_names, whole_number, whole_numbers
 from envs import TASKS
@@ -89,7 +88,6 @@ TEST_SECONDS = 120
 RUN_SEEDS = (1, 10)
 CELL_TASK = "R+L2"
 CELL_WORDS = ["checkpoint_every=1000000000", "threads=1"]
-MPS = "nvidia-cuda-mps-control"
 STOPPING = 40
 """Seconds that cells get to save what they have, at the end."""
 
@@ -235,24 +233,6 @@ def measure_runs_of(options: Options) -> Table | None:
     return measure_each(options, cases, measure_run, runs_table)
 
 
-@contextmanager
-def shared_gpu(device: torch.device) -> Iterator[dict[str, str]]:
-    """Runs NVIDIA's Multi-Process Service, where it is installed. Gives what processes need in their environment.
-
-    It runs kernels of several processes side by side. Without it a GPU runs those of one process at a time.
-    """
-    if device.type != "cuda" or not shutil.which(MPS):
-        yield {}
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {"CUDA_MPS_PIPE_DIRECTORY": folder, "CUDA_MPS_LOG_DIRECTORY": folder}
-        subprocess.run([MPS, "-d"], env=os.environ | environment, check=True, stdout=subprocess.DEVNULL)
-        try:
-            yield environment
-        finally:
-            subprocess.run([MPS], input="quit\n", text=True, env=os.environ | environment, stdout=subprocess.DEVNULL)
-
-
 def train_cells(options: Options) -> Table | None:
     """Train full-length cells, all at once, until they are done or the time is over."""
     if options.seconds_left < STOPPING:
@@ -263,13 +243,13 @@ def train_cells(options: Options) -> Table | None:
     started = time.monotonic()
     running: dict[str, subprocess.Popen] = {}
     with shared_gpu(options.device) as environment:
-        for name in options.cells:
-            command = [sys.executable, "run.py", f"algo={name}", *words]
-            with open(options.out / f"cell-{name}.txt", "w", encoding="utf-8") as file:
-                running[name] = subprocess.Popen(
-                    command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, env=os.environ | environment
-                )
         try:
+            for name in options.cells:
+                command = [sys.executable, "run.py", f"algo={name}", *words]
+                with open(options.out / f"cell-{name}.txt", "w", encoding="utf-8") as file:
+                    running[name] = subprocess.Popen(
+                        command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, env=os.environ | environment
+                    )
             while any(p.poll() is None for p in running.values()) and options.seconds_left > STOPPING:
                 time.sleep(0.5)
         finally:
@@ -384,6 +364,7 @@ def main(arguments: list[str]) -> int:
         return 0
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # what was started is stopped first
     try:
         options = parse_arguments(arguments)
         options.out.mkdir(parents=True, exist_ok=True)

@@ -4,10 +4,11 @@
     python bench/publish.py results/ env=R+L2 algo=DPre+     # these cells only
     python bench/publish.py results/ out=DIR                 # to another folder
 
-A cell (task, algorithm and settings) is published with all its seeds or not at all, so that no seed is dropped. A run
-is refused where it has not ended, where its provenance is missing, names uncommitted changes or more than one commit,
-where its settings are not those that its folder says, and where the same run is there already with another content.
-The command names every refused run with the reason, publishes the other cells, and exits with code 1.
+A cell (task, algorithm and settings) is published with all its seeds or not at all, so that no seed is dropped. It is
+refused where a run has not ended, where its provenance is missing, names uncommitted changes or more than one commit,
+and where its settings are not those that its folder says. A seed that is published already stays as it is, and a second
+run of it is refused alone. The command names every refused run with the reason, publishes the rest, and exits with code
+1.
 
 The files are described in store/published.py; `python plot.py docs/data` makes tables and figures from them.
 """
@@ -57,10 +58,14 @@ def publish(root: Path, out: Path, tasks: Sequence[str], algos: Sequence[str]) -
         for folder in folders:
             try:
                 run = checked(folder)
-                if is_new(there.get((task, *run.key)), run):
-                    ready.append(run)
             except RefusedError as error:
                 problems.append(f"{folder}: {error}")
+                continue
+            published_before = there.get((task, *run.key))
+            if published_before is None:
+                ready.append(run)
+            elif published_before.row() != run.row():
+                refused.append(f"{folder}: another run of this seed is published already")
         if problems:
             refused += problems
         else:
@@ -107,15 +112,6 @@ def _check_settings(run: Run) -> None:
             raise RefusedError(f"its folder says {says}, its config.yaml {holds}")
     if run.result is not None and run.result["steps"] != config.steps:
         raise RefusedError(f"it has {run.result['steps']} steps of {config.steps}")
-
-
-def is_new(there: PublishedRun | None, run: PublishedRun) -> bool:
-    """Whether `run` is new. Raises RefusedError where the same run is there already with another content."""
-    if there is None:
-        return True
-    if there.row() != run.row():
-        raise RefusedError("it is published already, with another content")
-    return False
 
 
 def main(argv: Sequence[str]) -> int:

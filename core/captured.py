@@ -14,12 +14,13 @@ EAGER_CALLS = 3
 class Captured:
     """`function`, called as it is on a CPU, and on a GPU, after its first calls, repeated as a graph without gradients.
 
-    The inputs of all calls have the same shapes. The function makes one tensor of them and of memory that keeps its
-    place, such as the parameters of networks. It draws no random numbers. A call overwrites what the last one returned.
+    The inputs of all calls are on `device` and have the same shapes. The function makes one tensor of them and of
+    memory that keeps its place, such as the parameters of networks. It draws no random numbers, and what it reads from
+    Python is fixed when the graph is made. A call overwrites what the last one returned.
     """
 
-    def __init__(self, function: Callable[..., Tensor]):
-        self.function = function
+    def __init__(self, function: Callable[..., Tensor], device: torch.device):
+        self.function, self.device = function, device
         self.calls = 0
         self.graph: torch.cuda.CUDAGraph | None = None
         self.inputs: list[Tensor] = []
@@ -27,7 +28,7 @@ class Captured:
 
     @torch.no_grad()
     def __call__(self, *inputs: Tensor) -> Tensor:
-        if inputs[0].device.type != "cuda":
+        if self.device.type != "cuda":
             return self.function(*inputs)
         if self.graph is None:
             if self.calls < EAGER_CALLS:

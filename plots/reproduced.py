@@ -47,7 +47,10 @@ def overview(cells: Cells) -> str:
     The first letter of a name is that of its base, D or S; the rest is its map. NFW stands alone, beside TD3's.
     """
     found: dict[tuple[str, str], dict[str, str]] = {}
-    names = {algo: algo.lstrip("DS") for algo in order_algos({algo for by_algo in cells.values() for algo in by_algo})}
+    names = {
+        algo: algo[1:] if algo[0] in "DS" else algo
+        for algo in order_algos({algo for by_algo in cells.values() for algo in by_algo})
+    }
     for task in order_tasks(cells):
         for algo in names:
             if runs := cells[task].get(algo):

@@ -103,6 +103,11 @@ class DrawsForAll(TD3):
         return super().explore(obs, range(len(self.seeds)))
 
 
+class ExploresInDoublePrecision(TD3):
+    def explore(self, obs, which):
+        return super().explore(obs, which).double()
+
+
 class RemembersForAll(OrnsteinUhlenbeck):
     def explore(self, obs, which):
         suggested = super().explore(obs, which)
@@ -187,6 +192,7 @@ BROKEN = {
     ForgetsATarget: "the module self.critic_target is not in networks",
     ForgetsItsMemory: r"interrupted and resumed differs .* first in transitions .* memory\(\)",
     CopiesItsMemory: r"memory\(\)\['.*'\] is a copy",
+    ExploresInDoublePrecision: r"explore\(\) returns torch.float64, expected torch.float32",
     DrawsForAll: "draws from the stream of position 1; give the streams which=which",
     RemembersForAll: r"changes memory\(\)\['noise'\] of position 1; .* the rows `which` alone",
     ForgetsTheMap: "violates the constraint by .* the map",

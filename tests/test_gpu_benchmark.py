@@ -7,8 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
+import bench.shared_gpu as sharing
 from bench import lockstep
+from bench.mps import shared_gpu
 from envs.locomotion import HalfCheetah
 
 ROOT = Path(__file__).parents[1]
@@ -108,3 +111,51 @@ def test_options(bench, tmp_path, capsys):
         assert bench.main(["device=cpu", f"out={tmp_path}", *words][1 if words[0].startswith("device") else 0 :]) == 2
         error = capsys.readouterr().err
         assert complaint in error and error.count("\n") == 1
+
+
+MPS = """#!/bin/sh
+[ "$1" = -d ] || read command
+echo "$1$command $CUDA_MPS_PIPE_DIRECTORY" >> {log}
+exit {code}
+"""
+
+
+@pytest.fixture
+def mps(tmp_path, monkeypatch):
+    """A stand-in for NVIDIA's command that logs its calls."""
+
+    def install(code=0):
+        command = tmp_path / "bin" / "nvidia-cuda-mps-control"
+        command.parent.mkdir()
+        command.write_text(MPS.format(log=tmp_path / "log", code=code))
+        command.chmod(0o755)
+        monkeypatch.setenv("PATH", f"{command.parent}:/usr/bin:/bin")
+        return tmp_path / "log"
+
+    return install
+
+
+def test_the_multi_process_service_runs_while_processes_share_a_gpu(mps):
+    log = mps()
+    with pytest.raises(KeyboardInterrupt), shared_gpu(torch.device("cuda")) as environment:
+        folder = environment["CUDA_MPS_PIPE_DIRECTORY"]
+        assert log.read_text() == f"-d {folder}\n"
+        raise KeyboardInterrupt
+    assert log.read_text() == f"-d {folder}\nquit {folder}\n"
+    with shared_gpu(torch.device("cpu")) as environment:
+        assert environment == {}
+
+
+def test_processes_take_turns_where_the_service_does_not_start(mps, capsys):
+    mps(code=1)
+    with shared_gpu(torch.device("cuda")) as environment:
+        assert environment == {}
+    assert "take turns" in capsys.readouterr().err
+
+
+def test_processes_are_measured_beside_each_other(capfd):
+    assert sharing.main(["device=cpu", "processes=1,2", "seeds=1", "seconds=1", "algo=SPre", "env=R+L2"]) == 0
+    title, turns = capfd.readouterr().out.splitlines()
+    assert title.split("\t")[1:] == ["1", "2"]
+    assert all(float(rate.replace(",", "")) > 0 for rate in turns.split("\t")[1:])
+    assert sharing.main(["processes=0"]) == 2

@@ -167,6 +167,24 @@ def test_a_gradient_step_asks_nothing_of_its_device(name, task):
     }
 
 
+@pytest.mark.parametrize("name, task", [("DPre", "W+M"), ("SPre", "W+M"), ("SRad", "R+L2")])
+def test_repeated_exploration_is_that_of_eager_calls(name, task, monkeypatch):
+    """With a stand-in for a CUDA graph, which calls the function again on the memory of the captured inputs."""
+
+    class Graph:
+        def replay(self):
+            captured.output.copy_(captured.function(*captured.inputs))
+
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
+    monkeypatch.setattr(torch.cuda, "graph", lambda graph: nullcontext())
+    eager, repeated = make(name, task)[0], make(name, task)[0]
+    captured = repeated.explored
+    captured.device = torch.device("cuda")
+    expected, found = (explored(agent, 3 * EAGER_CALLS) for agent in (eager, repeated))
+    assert torch.equal(found, expected)
+    assert captured.calls == EAGER_CALLS and isinstance(captured.graph, Graph) and eager.explored.graph is None
+
+
 def explored(agent, calls, device="cpu"):
     """Suggestions of `calls` steps, between which the actor learns; the stream of noise goes on."""
     generator = torch.Generator().manual_seed(1)

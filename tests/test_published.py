@@ -1,6 +1,7 @@
 """Published runs: equal to their folders in every bit; what must not be published is refused."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -107,6 +108,22 @@ def test_a_refused_run_keeps_its_whole_cell_back(results, tmp_path, capsys, reas
     errors = capsys.readouterr().err
     assert "DPre/seed=1" in errors and reason in errors
     assert [run.key for run in read_published(tmp_path / "data")] == [("SRad", "SRad", 0), ("SRad", "SRad", 1)]
+
+
+def test_a_published_run_is_not_replaced_and_other_seeds_of_its_cell_come_beside_it(results, tmp_path, capsys):
+    out, other = tmp_path / "data", tmp_path / "other"
+    shutil.copytree(results, other)
+    shutil.rmtree(other / "R+L2" / "SRad" / "seed=1")
+    assert publish(other, out) == 0
+    before = {run.key: run.row() for run in read_published(out)}
+    edited("result.json", {"return_mean": 99.0})(results / "R+L2" / "SRad" / "seed=0")
+    capsys.readouterr()
+    assert publish(results, out) == 1
+    printed = capsys.readouterr()
+    assert "SRad/seed=0: another run of this seed is published already" in printed.err
+    assert "R+L2 SRad seed 1" in printed.out
+    after = {run.key: run.row() for run in read_published(out)}
+    assert before.items() <= after.items() and after.keys() - before.keys() == {("SRad", "SRad", 1)}
 
 
 def test_a_published_run_is_not_replaced(results, tmp_path, capsys):

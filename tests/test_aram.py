@@ -209,7 +209,7 @@ def test_the_reward_shift_is_for_steps_of_the_environment_alone():
     plain.update(batch._replace(reward=batch.reward + 0.5))
     assert torch.equal(shifted.losses["critic"], plain.losses["critic"])
     reacher, others = (ALGORITHMS["ARAM"].paper_config("ARAM", "R+L2", group, 1) for group in ("Reacher", "Others"))
-    assert (reacher.reward_shift, others.reward_shift) == (1.0, 0.0)
+    assert (reacher.reward_shift, others.reward_shift) == (0.2, 0.0)
 
 
 def test_a_fixed_temperature_stays():

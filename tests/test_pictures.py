@@ -139,7 +139,7 @@ def test_hyperparameter_table():
     published, further = ({row[0].lines[0]: [cell.lines[0] for cell in row] for row in s} for s in table.sections)
     paper = [ALGORITHMS[name].agent.paper for name in PAPER]
     assert set(published) == {key for table in paper for settings in table.values() for key in settings}
-    assert further["reward_shift"][2:] == ["–", "–", "1.0", "–", "–", "0.0", "–", "–", "0.0"]
+    assert further["reward_shift"][2:] == ["–", "–", "0.2", "–", "–", "0.0", "–", "–", "0.0"]
     assert "policy_delay" in further and not {"seed", "results", "steps"} & set(further)
     assert published["hidden"][2:] == ["400, 300"] * 4 + ["256, 256"] * 2 + ["400, 300"] + ["256, 256"] * 2
     assert published["gsde"][2:] == ["–", "True", "–", "–", "False", "–", "–", "False", "–"]

@@ -18,6 +18,7 @@ from torch.nn.functional import softplus
 from torch.optim import Optimizer
 
 from core.agent import Agent
+from core.captured import Captured
 from core.config import Config, setting
 from core.maps import Sample
 from core.networks import MLP, Adam, TwinCritic, frozen_copy, rows_of, soft_update
@@ -136,6 +137,7 @@ class SAC(Agent):
         self.actor_optimizer = Adam(self.actor.parameters(), config.learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), config.learning_rate)
         self.temperature_optimizer = Adam(self.temperature.parameters(), config.learning_rate)
+        self.explored = Captured(self.noisy_suggestion)
         self.target_entropy = -float(self.action_dim)
         self.rollout_noise = torch.zeros(seeds, *self.actor.noise_shape, device=self.device)
         self.entropy = torch.zeros(seeds, 1, device=self.device)  # of the policy at the last batch's states
@@ -166,12 +168,15 @@ class SAC(Agent):
             for i in which:
                 self.rollout_noise[i] = fresh[i]
 
-    @torch.no_grad()
     def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
         if self.config.gsde:
             noise = self.rollout_noise
         else:
             noise = self.exploration.normal(*self.actor.noise_shape, which=which).unsqueeze(1)
+        return self.explored(obs, noise)
+
+    def noisy_suggestion(self, obs: Tensor, noise: Tensor) -> Tensor:
+        """A sample of the policy at obs (seeds, n), before the map; `noise` as in the actor's `sample`."""
         return self.squash(self.actor.sample(obs.unsqueeze(1), noise).suggested.squeeze(1))
 
     def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:

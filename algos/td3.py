@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from core.agent import Agent
+from core.captured import Captured
 from core.config import AT_LEAST_ONE, NOT_NEGATIVE, Config, setting
 from core.networks import MLP, Adam, TwinCritic, frozen_copy, rows_of, soft_update
 from core.replay import Batch
@@ -66,6 +67,7 @@ class TD3(Agent):
         self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
         self.actor_optimizer = Adam(self.actor.parameters(), learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), learning_rate)
+        self.explored = Captured(self.noisy_suggestion)
         # Measures of the last step of each kind, a row a seed.
         self.measures = {name: torch.zeros(len(self.seeds), device=self.device) for name in MEASURES}
 
@@ -94,9 +96,12 @@ class TD3(Agent):
         """mu(s): the action before the map."""
         return self.squash(actor(obs))
 
-    @torch.no_grad()
     def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
-        noise = self.config.action_noise * self.exploration.normal(self.action_dim, which=which)
+        return self.explored(obs, self.exploration.normal(self.action_dim, which=which))
+
+    def noisy_suggestion(self, obs: Tensor, noise: Tensor) -> Tensor:
+        """mu(s) plus exploration noise, for obs (seeds, n) and standard normal `noise` (seeds, d)."""
+        noise = self.config.action_noise * noise
         return self.suggest(self.actor, obs.unsqueeze(1)).squeeze(1) + noise
 
     def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:

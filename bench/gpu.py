@@ -10,10 +10,13 @@ The parts come in this order, and each result is saved as soon as it is there, s
 - `updates`: gradient steps of TD3 (DPre) and SAC (SPre), sampling included, of 1, 10 and 30 seeds in lockstep on R+L2
   and HC+O, beside the floor (the same matrix products and nothing else, as a CUDA graph) and, for one seed, beside
   eager PyTorch in CleanRL's style (bench/eager.py); CPU time of the thread that launches them; GPU memory;
-- `agreement`: how far parameters on the GPU are from those on the CPU over the first 200 updates, all 13 algorithms;
+- `agreement`: how far parameters on the GPU are from those on the CPU over the first 200 updates, all 13 algorithms,
+  beside what one rounding of the first parameters makes on the CPU;
 - `runs`: steps a second of whole runs, environment included, and where the time of a step of all seeds goes;
-- `cells`: full-length cells of R+L2, ten seeds each, several processes at once, until the time is over. Their folders
-  are in `out`/runs, without checkpoints while they run; the same command resumes those that the time has cut short.
+- `cells`: full-length cells of R+L2, the algorithms `cells` with the seeds `cell_seeds`, a process each, until the time
+  is over. Their folders are in `out`/runs, without checkpoints while they run; the same command resumes those that the
+  time has cut short. Where NVIDIA's Multi-Process Service is installed, the processes share the GPU through it;
+  otherwise they take turns.
 
 Every part has a table in `out` as CSV and Markdown, gpu.md has all of them, and machine.json names the machine. What
 fails is in errors.txt, and the rest goes on.
@@ -36,13 +39,15 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,10 +62,12 @@ import torch
 from algos import PAPER
 from bench.common import machine_name
 from bench.lockstep import ALGO, PHASES, measure_agreement, measure_run, measure_updates
+from core.config import parse_seeds
 from core.words import ConfigError, parse_words, split_names, whole_number, whole_numbers
 from envs import TASKS
 from store.folder import find_runs, read_run
 from store.provenance import describe_environment
+from sweep.cells import format_seeds
 from sweep.train import check_device
 from tables import MISSING, Table, text_cells, to_markdown, to_terminal, write_table
 
@@ -72,15 +79,17 @@ DEFAULTS = {
     "seeds": "1,10,30",
     "steps": "200",
     "cells": "DPre,SRad,DAlpha,SPre,DRad",
+    "cell_seeds": "0-9",
     "minutes": "9",
     "device": "cuda",
     "out": "bench/results/gpu",
 }
-TESTS = ["tests/test_graph.py", "tests/test_device.py", "tests/test_ahead.py", "-k", "cuda or run_on_a_gpu or ahead"]
+TESTS = ["tests/test_graph.py", "tests/test_device.py", "tests/test_ahead.py", "-k", "cuda or gpu or ahead"]
 TEST_SECONDS = 120
 RUN_SEEDS = (1, 10)
-CELL_TASK, CELL_SEEDS = "R+L2", range(10)
+CELL_TASK = "R+L2"
 CELL_WORDS = ["checkpoint_every=1000000000", "threads=1"]
+MPS = "nvidia-cuda-mps-control"
 STOPPING = 40
 """Seconds that cells get to save what they have, at the end."""
 
@@ -93,6 +102,7 @@ class Options:
     seeds: list[int]
     steps: int
     cells: list[str]
+    cell_seeds: Sequence[int]
     device: torch.device
     out: Path
     deadline: float
@@ -148,9 +158,17 @@ def agreement_table(records: Sequence[dict]) -> Table:
     by_name: dict[str, list[dict]] = {}
     for r in records:
         by_name.setdefault(r["algo"], []).append(r)
-    rows = [text_cells(name, *(f"{r['difference']:.1e}" for r in found)) for name, found in by_name.items()]
+    rows = [
+        text_cells(
+            name,
+            *(f"{r['difference']:.1e}" for r in found),
+            *(f"{r['rounding']:.1e}" for r in found if r["steps"] == counts[-1]),
+        )
+        for name, found in by_name.items()
+    ]
     title = f"Largest relative difference to the CPU's parameters after so many updates, {records[0]['task']}"
-    return Table("agreement", title, ["", *map(str, counts)], 1, [rows], list(records))
+    header = ["", *map(str, counts), f"{counts[-1]}, CPU with another rounding"]
+    return Table("agreement", title, header, 1, [rows], list(records))
 
 
 def runs_table(records: Sequence[dict]) -> Table:
@@ -217,27 +235,48 @@ def measure_runs_of(options: Options) -> Table | None:
     return measure_each(options, cases, measure_run, runs_table)
 
 
+@contextmanager
+def shared_gpu(device: torch.device) -> Iterator[dict[str, str]]:
+    """Runs NVIDIA's Multi-Process Service, where it is installed. Gives what processes need in their environment.
+
+    It runs kernels of several processes side by side. Without it a GPU runs those of one process at a time.
+    """
+    if device.type != "cuda" or not shutil.which(MPS):
+        yield {}
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {"CUDA_MPS_PIPE_DIRECTORY": folder, "CUDA_MPS_LOG_DIRECTORY": folder}
+        subprocess.run([MPS, "-d"], env=os.environ | environment, check=True, stdout=subprocess.DEVNULL)
+        try:
+            yield environment
+        finally:
+            subprocess.run([MPS], input="quit\n", text=True, env=os.environ | environment, stdout=subprocess.DEVNULL)
+
+
 def train_cells(options: Options) -> Table | None:
     """Train full-length cells, all at once, until they are done or the time is over."""
     if options.seconds_left < STOPPING:
         print("the time is over before the cells", file=sys.stderr)
         return None
-    seeds = f"seed={CELL_SEEDS[0]}-{CELL_SEEDS[-1]}"
+    seeds = f"seed={format_seeds(options.cell_seeds)}"
     words = [f"env={CELL_TASK}", seeds, f"device={options.device}", f"results={options.out / 'runs'}", *CELL_WORDS]
     started = time.monotonic()
     running: dict[str, subprocess.Popen] = {}
-    for name in options.cells:
-        with open(options.out / f"cell-{name}.txt", "w", encoding="utf-8") as file:
+    with shared_gpu(options.device) as environment:
+        for name in options.cells:
             command = [sys.executable, "run.py", f"algo={name}", *words]
-            running[name] = subprocess.Popen(command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT)
-    try:
-        while any(p.poll() is None for p in running.values()) and options.seconds_left > STOPPING:
-            time.sleep(0.5)
-    finally:
-        stop(list(running.values()))
+            with open(options.out / f"cell-{name}.txt", "w", encoding="utf-8") as file:
+                running[name] = subprocess.Popen(
+                    command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, env=os.environ | environment
+                )
+        try:
+            while any(p.poll() is None for p in running.values()) and options.seconds_left > STOPPING:
+                time.sleep(0.5)
+        finally:
+            stop(list(running.values()))
     wall = time.monotonic() - started
     records = [cell_record(options, name, process.returncode, wall) for name, process in running.items()]
-    return cells_table(records)
+    return cells_table(records, bool(environment))
 
 
 def stop(processes: Sequence[subprocess.Popen]) -> None:
@@ -264,13 +303,13 @@ def cell_record(options: Options, name: str, code: int, wall: float) -> dict[str
     results = [run.result for run in runs if run.result]
     steps = min((int(max(run.evaluations.step, default=0)) for run in runs), default=0)
     seconds = max((result["seconds"]["total"] for result in results), default=wall)
-    record = {"algo": name, "task": CELL_TASK, "seeds": len(CELL_SEEDS), "processes": len(options.cells)}
+    record = {"algo": name, "task": CELL_TASK, "seeds": len(options.cell_seeds), "processes": len(options.cells)}
     record |= {"exit_code": code, "finished": len(results), "evaluated_to_step": steps, "seconds": seconds}
     mean = sum(result["return_mean"] for result in results) / len(results) if results else ""
     return record | {"steps_per_second": steps / seconds, "return_mean": mean}
 
 
-def cells_table(records: Sequence[dict]) -> Table:
+def cells_table(records: Sequence[dict], shared: bool) -> Table:
     rows = [
         text_cells(
             r["algo"],
@@ -282,7 +321,8 @@ def cells_table(records: Sequence[dict]) -> Table:
         )
         for r in records
     ]
-    title = f"Cells of {CELL_TASK}, {records[0]['seeds']} seeds each, {len(records)} processes at once"
+    sharing = "sharing the GPU through MPS" if shared else "taking turns"
+    title = f"Cells of {CELL_TASK}, {records[0]['seeds']} seeds each, {len(records)} processes at once, {sharing}"
     return Table("cells", title, ["", "finished", "steps", "seconds", "steps/s", "return"], 1, [rows], list(records))
 
 
@@ -301,6 +341,7 @@ def parse_arguments(arguments: Sequence[str]) -> Options:
         list(dict.fromkeys(whole_numbers("seeds", options["seeds"]))),
         whole_number("steps", options["steps"]),
         split_names("cells", options["cells"], dict.fromkeys(PAPER)),
+        parse_seeds(options["cell_seeds"]),
         torch.device(options["device"]),
         Path(options["out"]).expanduser().resolve(),
         time.monotonic() + 60 * minutes,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -15,6 +16,7 @@ from bench.common import agent_of, fill_replay, make_config
 from bench.eager import EagerUpdate
 from bench.floor import Floor, update_products
 from bench.phases import Stopwatch, new_trainer
+from core.agent import Agent
 from core.ahead import Ahead
 from core.cuda_graph import CapturedStep, GradientSteps
 
@@ -26,6 +28,7 @@ WARM_UP, SETTLED, LEARNED = 1_000, 2_000, 5_000
 """Of a run: environment steps before the first gradient step, before the measurement, and at its end."""
 COMPARED = (1, 10, 50, 200)
 """Gradient steps after which devices are compared."""
+ROUNDINGS = 3
 NEVER = 10**9
 
 PHASES = ("draws", "policy", "map", "environments", "transfer", "gradient step", "waiting", "rest")
@@ -60,6 +63,7 @@ def memory_of(device: torch.device) -> Iterator[Callable[[], float | str]]:
     """A function that returns the most GPU memory in megabytes since the beginning, "" on a CPU."""
     on_gpu = device.type == "cuda"
     if on_gpu:
+        gc.collect()  # agents and their graphs refer to each other
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
     yield lambda: torch.cuda.max_memory_allocated(device) / 1e6 if on_gpu else ""
@@ -103,24 +107,43 @@ def measure_updates(base: str, task: str, seeds: int, count: int, device: torch.
 def measure_agreement(name: str, task: str, device: torch.device) -> list[dict[str, Any]]:
     """How far the parameters of two seeds on `device` are from those on the CPU, after numbers of gradient steps.
 
-    The difference is the largest of any parameter tensor, relative to the largest number in it.
+    The difference is the largest of any parameter tensor, relative to the largest number in it. `rounding` is that
+    between trainings on the CPU whose first parameters differ by a rounding, the largest of `ROUNDINGS`: what a kink of
+    a network or a map makes of a rounding.
     """
     there_config = make_config(name, env=task, hidden="[64,64]", batch_size=32, device=device)
-    agents = [agent_of(config, range(2)) for config in (replace(there_config, device="cpu"), there_config)]
+    here_config = replace(there_config, device="cpu")
+    agents = [agent_of(config, range(2)) for config in (here_config, there_config, *[here_config] * ROUNDINGS)]
+    for number, agent in enumerate(agents[2:]):
+        round_differently(agent, torch.Generator().manual_seed(number))
     steps = [GradientSteps(agent, fill_replay(agent, 200), 32) for agent in agents]
     records = []
     for number in range(1, COMPARED[-1] + 1):
         for step in steps:
             step()
         if number in COMPARED:
-            differences = []
-            for i in range(2):
-                here, there = (agent.state(i) for agent in agents)
-                differences += [
-                    ((there[k] - v).abs().max() / v.abs().max().clamp(1e-8)).item() for k, v in here.items()
-                ]
-            records.append({"algo": name, "task": task, "steps": number, "difference": max(differences)})
+            here, there, *others = agents
+            rounding = max(difference(here, other) for other in others)
+            record = {"algo": name, "task": task, "steps": number, "difference": difference(here, there)}
+            records.append(record | {"rounding": rounding})
     return records
+
+
+@torch.no_grad()
+def round_differently(agent: Agent, generator: torch.Generator) -> None:
+    """Change every parameter by about half the distance to the next float32, up or down."""
+    for network in agent.networks().values():
+        for parameter in network.parameters():
+            parameter.mul_(1 + 6e-8 * torch.randn(parameter.shape, generator=generator).sign())
+
+
+def difference(agent: Agent, other: Agent) -> float:
+    """The largest difference of any parameter tensor of any seed, relative to the largest number in it."""
+    found = []
+    for i in range(len(agent.seeds)):
+        one, two = agent.state(i), other.state(i)
+        found += [((two[k] - v).abs().max() / v.abs().max().clamp(1e-8)).item() for k, v in one.items()]
+    return max(found)
 
 
 class _Enough(Exception):

@@ -182,11 +182,16 @@ class Agent(Snapshots):
 
         obs (seeds, n) and `center` (seeds, d), from `centers`, are on the CPU. Ignore the other rows of the actions.
         """
-        raw = torch.zeros(len(self.seeds), self.action_dim)
-        if warming_up:
-            raw[warming_up] = self.warm_up(warming_up)[warming_up].cpu()
-        if exploring:
-            raw[exploring] = self.explore(obs.to(self.device), exploring)[exploring].cpu()
+        if len(exploring) == len(self.seeds):
+            raw = self.explore(obs.to(self.device), exploring).cpu()
+        elif len(warming_up) == len(self.seeds):
+            raw = self.warm_up(warming_up).cpu()
+        else:
+            raw = torch.zeros(len(self.seeds), self.action_dim)
+            if warming_up:
+                raw[warming_up] = self.warm_up(warming_up).cpu()[warming_up]
+            if exploring:
+                raw[exploring] = self.explore(obs.to(self.device), exploring).cpu()[exploring]
         suggested = self.bounded(raw)
         if exploring:
             executed = self.feasible(obs, suggested, center)

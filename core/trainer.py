@@ -209,9 +209,6 @@ class Trainer:
             for seed, outcome in self._outcomes(acting, action.suggested.numpy(), action.executed.numpy()):
                 i = seed.position
                 obs, reward[i], terminated[i], truncated, _ = outcome
-                if not (np.isfinite(obs).all() and np.isfinite(reward[i])):
-                    self._fail(seed, "observation or reward is not finite")
-                    continue
                 stepped.append(seed)
                 arrived[i] = obs
                 if terminated[i] or truncated:
@@ -243,7 +240,7 @@ class Trainer:
             self.agent.start_rollout(new_rollout)
 
     def _outcomes(self, seeds: Sequence[Seed], suggested: np.ndarray, executed: np.ndarray) -> list[tuple[Seed, tuple]]:
-        """Step the environments of `seeds`: what `step` returned, without the seeds whose action was not executed."""
+        """Step the environments of `seeds`: what `step` returned, without the seeds that fail here."""
         finite = np.isfinite(suggested).all(-1)
         sound = []
         for seed in seeds:
@@ -258,7 +255,11 @@ class Trainer:
                 self._fail(seed, refusal(outcome, self.obs[seed.position]))
             else:
                 taken.append((seed, outcome))
-        return taken
+        if taken:
+            obs, rewards = (np.array([outcome[k] for _, outcome in taken], np.float32) for k in (0, 1))
+            for k in np.flatnonzero(~(np.isfinite(obs).all(-1) & np.isfinite(rewards))):
+                self._fail(taken[k][0], "observation or reward is not finite")
+        return [(seed, outcome) for seed, outcome in taken if not seed.ended]
 
     # ---------------------------------------------------------------- evaluations and ends
 

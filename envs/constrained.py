@@ -314,12 +314,13 @@ class ActionConstrainedEnv(gymnasium.Env):
             obs, exact = torch.from_numpy(self._obs), torch.from_numpy(action.astype(np.float64))
             exact = self.constraint.project(obs, exact)
             action, violation = exact.numpy(), self.constraint.violation(obs, exact).item()
-        allowed = allowed_violation(self.constraint, torch.from_numpy(self._obs), violation).item()
-        if not violation <= allowed:  # a NaN is refused as well
-            return InfeasibleActionError(
-                f"{self._where()}: action {action} violates the constraint by {violation:.3g} "
-                f"(at most {allowed:g} is allowed)"
-            )
+        if not violation <= TOLERANCE:  # a NaN is refused as well
+            allowed = allowed_violation(self.constraint, torch.from_numpy(self._obs), violation).item()
+            if not violation <= allowed:
+                return InfeasibleActionError(
+                    f"{self._where()}: action {action} violates the constraint by {violation:.3g} "
+                    f"(at most {allowed:g} is allowed)"
+                )
         self.largest_violation = max(self.largest_violation, violation)
         return action
 

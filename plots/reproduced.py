@@ -42,27 +42,33 @@ def read_cells(root: str | Path) -> Cells:
 
 
 def overview(cells: Cells) -> str:
-    """README's table: a row an algorithm, a column a task, our mean beside the paper's."""
-    tasks = order_tasks(cells)
-    rows = [["", *tasks], ["---"] * (len(tasks) + 1)]
-    for algo in order_algos({algo for by_algo in cells.values() for algo in by_algo}):
-        row = [algo]
-        for task in tasks:
+    """README's table: a row a map, a column each for TD3 and SAC on a task, our mean beside the paper's.
+
+    The first letter of a name is that of its base, D or S; the rest is its map. NFW stands alone, beside TD3's.
+    """
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    names = {algo: algo.lstrip("DS") for algo in order_algos({algo for by_algo in cells.values() for algo in by_algo})}
+    for task in order_tasks(cells):
+        for algo in names:
             if runs := cells[task].get(algo):
                 ours, theirs = _results(runs), read_paper().get((task, DEFAULT_BATCH, algo))
                 digits = decimals(stat.mean for stat in (ours, theirs) if stat)
-                row.append(f"**{_text(ours, digits)}**{_mark(runs)} (n={ours.n}) / {_text(theirs, digits)}")
-            else:
-                row.append(MISSING)
-        rows.append(row)
+                column = found.setdefault((task, "SAC" if algo.startswith("S") else "TD3"), {})
+                column[names[algo]] = f"**{_text(ours, digits)}**{_mark(runs)} (n={ours.n}) / {_text(theirs, digits)}"
+    rows = [["", *(" ".join(key) for key in found)], ["---"] * (len(found) + 1)]
+    for name in dict.fromkeys(names.values()):
+        rows.append([name, *(column.get(name, MISSING) for column in found.values())])
     return _markdown(rows)
 
 
 def details(cells: Cells) -> str:
-    """The table of docs/results.md: a row a cell, with the results on Reacher adjusted for their starts."""
+    """The table of docs/results.md: a row a cell, with the results on Reacher adjusted for their starts.
+
+    The difference to the paper is that of the adjusted result, where there is one, in joint standard errors.
+    """
     rows = [
-        ["task", "algorithm", "seeds", "final result", "adjusted for the starts", "paper", "largest violation"],
-        ["---"] * 3 + ["---:"] * 4,
+        ["task", "algorithm", "seeds", "final result", "adjusted", "paper", "difference", "largest violation"],
+        ["---"] * 3 + ["---:"] * 5,
     ]
     for task in order_tasks(cells):
         for algo in order_algos(cells[task]):
@@ -75,7 +81,8 @@ def details(cells: Cells) -> str:
             seeds = ", ".join(f"{run.seed}{_mark([run])}" for run in runs)
             result = _text(ours, digits) + _mark(runs)
             violation = f"{max((run.result or run.failure)['largest_violation'] for run in runs):.1e}"
-            rows.append([task, algo, seeds, result, _text(adjusted, digits), _text(theirs, digits), violation])
+            numbers = [result, _text(adjusted, digits), _text(theirs, digits), _difference(adjusted or ours, theirs)]
+            rows.append([task, algo, seeds, *numbers, violation])
     return _markdown(rows)
 
 
@@ -97,6 +104,12 @@ def _text(stat: Statistic | None, digits: int) -> str:
     if stat is None:
         return MISSING
     return f"{stat.mean:.{digits}f}" + (f" ± {stat.se:.{digits}f}" if stat.n > 1 else "")
+
+
+def _difference(ours: Statistic, theirs: Statistic | None) -> str:
+    if theirs is None or ours.n == 1:
+        return MISSING
+    return f"{(ours.mean - theirs.mean) / math.hypot(ours.se, theirs.se):+.1f}"
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:

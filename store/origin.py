@@ -8,10 +8,13 @@ import sys
 import sysconfig
 import types
 from functools import cache
+from importlib.metadata import PathDistribution
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+_INTERPRETER = {"sitecustomize", "usercustomize"}
+"""Modules that set an interpreter up."""
 _PROJECT = {"algos", "bench", "constraints", "core", "envs", "plot", "plots", "run", "store", "sweep", "tables"}
 
 
@@ -66,10 +69,22 @@ def _user_path(file: str | None) -> Path | None:
     if not file:
         return None
     path = Path(file).resolve()
-    library = {"site-packages", "dist-packages"} & set(path.parts) or any(f in path.parents for f in _libraries())
-    if library or path in _commands():
+    if path in _commands() or path.stem in _INTERPRETER or _is_library(path):
         return None
     return path if path.is_file() and path.suffix == ".py" else None  # some modules invent the name of a file
+
+
+def _is_library(path: Path) -> bool:
+    if {"site-packages", "dist-packages"} & set(path.parts) or any(f in path.parents for f in _libraries()):
+        return True
+    return any(path.relative_to(folder).parts[0] in _installed(folder) for folder in path.parents)
+
+
+@cache
+def _installed(folder: Path) -> set[str]:
+    """The names in `folder` that belong to installed libraries, as `pip install --target` leaves them."""
+    found = [PathDistribution(about).files or [] for about in folder.glob("*.dist-info")]
+    return {file.parts[0] for files in found for file in files}
 
 
 def _main_is_command() -> bool:

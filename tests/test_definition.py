@@ -41,6 +41,7 @@ from core.maps import Project
 from envs import TASKS, Task
 from envs.reacher import Reacher
 from store.definition import describe, differences, is_own
+from store.origin import is_user, user_files
 from sweep.definition import define
 
 ROOT = Path(__file__).parents[1]
@@ -443,6 +444,23 @@ def test_libraries_outside_of_the_environment_are_libraries(tmp_path, monkeypatc
     import far_library
 
     assert is_own(describe({"value": far_library.f}))
+
+
+def test_libraries_in_a_folder_of_their_own_are_libraries_and_what_lies_beside_them_is_not(tmp_path, monkeypatch):
+    """As `pip install --target` leaves them."""
+    about = tmp_path / "aimed_library-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: aimed-library\nVersion: 1.0\n")
+    (about / "RECORD").write_text("aimed_library/__init__.py,,\naimed_library-1.0.dist-info/METADATA,,\n")
+    (tmp_path / "aimed_library").mkdir()
+    (tmp_path / "aimed_library" / "__init__.py").write_text("def f(x):\n    return x\n")
+    (tmp_path / "lying_beside.py").write_text("def f(x):\n    return x\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    import aimed_library
+    import lying_beside
+
+    assert not is_user(aimed_library.f) and is_user(lying_beside.f)
+    assert [file.name for file in user_files() if file.is_relative_to(tmp_path)] == ["lying_beside.py"]
 
 
 @pytest.fixture

@@ -27,7 +27,6 @@ def bench(monkeypatch):
     monkeypatch.setattr(lockstep, "COMPARED", (1, 3))
     monkeypatch.setattr(HalfCheetah, "max_episode_steps", 60)
     monkeypatch.setattr(module, "RUN_SEEDS", (1, 2))
-    monkeypatch.setattr(module, "CELL_SEEDS", range(2))
     monkeypatch.setattr(module, "TESTS", ["tests/test_ahead.py", "-k", "a_block_has"])
     monkeypatch.setattr(module.os, "cpu_count", lambda: 2)
     words = "steps=400 learning_starts=150 eval_every=200 eval_episodes=1 final_episodes=1 hidden=[8,8] batch_size=4"
@@ -41,7 +40,7 @@ def rows_of(path):
 
 
 def test_all_parts_from_measurement_to_tables(bench, tmp_path, capfd):
-    words = ["device=cpu", "task=HC+O", "seeds=1,2", "steps=2", "cells=DPre,SRad", f"out={tmp_path}"]
+    words = ["device=cpu", "task=HC+O", "seeds=1,2", "steps=2", "cells=DPre,SRad", "cell_seeds=0-1", f"out={tmp_path}"]
     assert bench.main(words) == 0, capfd.readouterr().err
     written = {path.name for path in tmp_path.iterdir()}
     tables = {f"{part}.{suffix}" for part in bench.PARTS for suffix in ("csv", "md")}
@@ -61,6 +60,7 @@ def test_all_parts_from_measurement_to_tables(bench, tmp_path, capfd):
         assert bool(record["eager_updates_per_second"]) == (record["seeds"] == "1") and record["gpu_mb"] == ""
     agreement = rows_of(tmp_path / "agreement.csv")
     assert {r["algo"] for r in agreement} == set(bench.PAPER) and len(agreement) == 26
+    assert all(float(r["rounding"]) > 0 for r in agreement)
     assert all(float(r["difference"]) == 0 for r in agreement)  # the CPU beside itself
     runs = rows_of(tmp_path / "runs.csv")
     assert [(r["seeds"], r["threads"]) for r in runs] == [*[("1", "1")] * 2, *[("2", "1")] * 2, *[("2", "2")] * 2]

@@ -16,6 +16,7 @@ import core.cuda_graph
 import envs
 from algos import ALGORITHMS
 from constraints import LinearConstraint
+from core.captured import EAGER_CALLS
 from core.cuda_graph import EAGER_STEPS, GradientSteps
 from core.replay import Batch, Replay
 from store.folder import read_run
@@ -168,6 +169,30 @@ def test_a_gradient_step_asks_nothing_of_its_device(name, task):
     }
 
 
+def explored(agent, calls, device="cpu"):
+    """Suggestions of `calls` steps, between which the actor learns; the stream of noise goes on."""
+    generator = torch.Generator().manual_seed(1)
+    found = []
+    for number in range(calls):
+        obs = torch.randn(len(SEEDS), agent.obs_dim, generator=generator)
+        which = [0, 1] if number % 3 else [1]
+        agent.start_rollout(which)
+        found.append(agent.explore(obs.to(device), which).cpu()[which])
+        with torch.no_grad():
+            for parameter in agent.actor.parameters():
+                parameter.mul_(1.1)
+    return torch.cat(found)
+
+
+@needs_cuda
+@pytest.mark.parametrize("name, task", [("DPre", "W+M"), ("DRad", "R+L2"), ("SPre", "W+M"), ("SRad", "R+L2")])
+def test_exploration_on_a_gpu_is_repeated_as_a_graph(name, task):
+    here, there = make(name, task)[0], make(name, task, "cuda")[0]
+    expected, found = explored(here, 3 * EAGER_CALLS), explored(there, 3 * EAGER_CALLS, "cuda")
+    assert there.explored.graph is not None and here.explored.graph is None
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
 @needs_cuda
 @pytest.mark.parametrize("name", ALGORITHMS)
 @pytest.mark.parametrize("task", ["W+M", "HC+O", "R+T"])
@@ -203,7 +228,7 @@ def test_a_run_on_a_gpu_is_interrupted_and_resumed_with_the_same_bits(name, tmp_
 
     def interrupt():
         calls.append(None)
-        if len(calls) == 700:
+        if len(calls) == 400:  # of about 500: env steps and gradient steps
             raise Interrupted(15)
 
     train(tmp_path / "whole")

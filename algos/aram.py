@@ -20,6 +20,7 @@ from torch.optim import Optimizer
 
 from algos.sac import SAC, GaussianActor, Temperature, squashed
 from core.agent import Action, Agent
+from core.captured import Captured
 from core.config import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, Config, setting
 from core.maps import Project, Sample
 from core.networks import MLP, Adam, Network, frozen_copy, rows_of, soft_update
@@ -103,6 +104,7 @@ class ARAM(Agent):
         self.actor_optimizer = Adam(self.actor.parameters(), config.learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), config.learning_rate)
         self.temperature_optimizer = Adam(self.temperature.parameters(), config.learning_rate)
+        self.explored = Captured(self.suggestions)
         self.target_entropy = -float(self.action_dim)
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -153,9 +155,9 @@ class ARAM(Agent):
         candidates = torch.zeros(seeds, draws, self.action_dim)
         if warming_up:
             uniform = self.exploration.uniform(draws, self.action_dim, which=warming_up)
-            candidates[warming_up] = uniform[warming_up].cpu()
+            candidates[warming_up] = uniform.cpu()[warming_up]
         if exploring:
-            candidates[exploring] = self.draw(obs.to(self.device), draws, exploring)[exploring].cpu()
+            candidates[exploring] = self.draw(obs.to(self.device), exploring).cpu()[exploring]
         feasible = self.constraint.violation(obs.unsqueeze(1), candidates) <= 0.0  # a NaN is rejected as well
         rejected = (~feasible).cumprod(-1).sum(-1)  # (seeds,): those before the first feasible one
         exhausted = rejected == draws
@@ -166,14 +168,16 @@ class ARAM(Agent):
         self.remember([*warming_up, *exploring], obs, candidates, rejected)
         return Action(suggested, executed, suggested)
 
-    def draw(self, obs: Tensor, draws: int, which: Sequence[int]) -> Tensor:
-        """Actions (seeds, draws, d) of the policy at obs (seeds, n). Only the rows `which` count."""
-        noise = self.exploration.normal(draws, self.action_dim, which=which)
+    def draw(self, obs: Tensor, which: Sequence[int]) -> Tensor:
+        """`most_rejections` actions (seeds, draws, d) of the policy at obs (seeds, n). Only the rows `which` count."""
+        return self.explored(obs, self.exploration.normal(self.config.most_rejections, self.action_dim, which=which))
+
+    def suggestions(self, obs: Tensor, noise: Tensor) -> Tensor:
+        """Actions of the policy at obs (seeds, n), for the episodes' preferences and `noise` (seeds, draws, d)."""
         return self.sample(obs.unsqueeze(1), self.preference.unsqueeze(1), noise).suggested
 
-    @torch.no_grad()
     def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
-        return self.draw(obs, 1, which).squeeze(1)
+        return self.draw(obs, which)[:, 0]
 
     def remember(self, which: Sequence[int], obs: Tensor, candidates: Tensor, rejected: Tensor) -> None:
         """Count a step of the seeds `which` and keep their rejected actions, the first ones of `candidates`.

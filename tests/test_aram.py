@@ -48,7 +48,7 @@ def test_the_first_feasible_draw_is_executed_and_those_before_are_kept(warming_u
     for step in range(15):
         obs = torch.randn(len(SEEDS), OBS, generator=torch.Generator().manual_seed(step))
         found = agent.act(obs, None, *who)
-        draws = twin.exploration.uniform(100, DIM) if warming_up else twin.draw(obs, 100, [0, 1]).detach()
+        draws = twin.exploration.uniform(100, DIM) if warming_up else twin.draw(obs, [0, 1])
         for i in range(len(SEEDS)):
             for draw in draws[i]:
                 if BALL.violation(obs[i], draw) <= 0:

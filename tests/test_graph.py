@@ -185,7 +185,9 @@ def explored(agent, calls, device="cpu"):
 
 
 @needs_cuda
-@pytest.mark.parametrize("name, task", [("DPre", "W+M"), ("DRad", "R+L2"), ("SPre", "W+M"), ("SRad", "R+L2")])
+@pytest.mark.parametrize(
+    "name, task", [("DPre", "W+M"), ("DRad", "R+L2"), ("SPre", "W+M"), ("SRad", "R+L2"), ("ARAM", "W+M")]
+)
 def test_exploration_on_a_gpu_is_repeated_as_a_graph(name, task):
     here, there = make(name, task)[0], make(name, task, "cuda")[0]
     expected, found = explored(here, 3 * EAGER_CALLS), explored(there, 3 * EAGER_CALLS, "cuda")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers import run_command
 
 from algos import ALGORITHMS
 from algos.aram import preferences
@@ -255,3 +256,20 @@ def test_a_step_without_the_losing_choices_has_the_gradient_of_one_with_all():
     torch.testing.assert_close(one, other)
     choices = torch.stack(everything).argmax(0)
     assert len(choices.unique()) > 2  # states differ in what is best
+
+
+@pytest.mark.parametrize(
+    "word, said",
+    [
+        ("rejected_share=1.5", "bad value 1.5 for rejected_share: must be in [0, 1]"),
+        ("eval_preference=-0.1", "bad value -0.1 for eval_preference: must be in [0, 1]"),
+        ("most_rejections=0", "bad value 0 for most_rejections: must be at least 1"),
+        ("temperature=0", "bad value 0.0 for temperature: must be positive"),
+        ("reward_shift=inf", "bad value inf for reward_shift: must be finite"),
+        ("gsde=true", "gsde does not apply to ARAM on R+L2"),
+        ("penalty=1", "penalty does not apply to ARAM on R+L2"),
+    ],
+)
+def test_bad_settings_are_refused_in_one_line(capsys, word, said):
+    assert run_command(["algo=ARAM", "env=R+L2", word]) == 2
+    assert capsys.readouterr().err == f"run.py: {said}\n"

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from algos.aram import ARAM
 from algos.definition import changes, define
 from algos.nfwpo import NFWPO
 from algos.policy import Policy, parts_of, restore, settings_of
@@ -99,6 +100,7 @@ PAPER = tuple(ALGORITHMS)
 ALGORITHMS |= {
     "DGauge": Algorithm(TD3, Gauge(), "layer"),
     "SGauge": Algorithm(SAC, Gauge(), "layer"),
+    "ARAM": Algorithm(ARAM, Project(), "environment"),
 }
 
 

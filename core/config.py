@@ -46,6 +46,7 @@ class Rule(NamedTuple):
 POSITIVE = Rule(lambda value: value > 0, "must be positive")
 NOT_NEGATIVE = Rule(lambda value: value >= 0, "must not be negative")
 AT_LEAST_ONE = Rule(lambda value: value >= 1, "must be at least 1")
+SHARE = Rule(lambda value: 0 <= value <= 1, "must be in [0, 1]")
 POSITIVE_SHARE = Rule(lambda value: 0 < value <= 1, "must be in (0, 1]")
 
 
@@ -82,7 +83,7 @@ class Config:
     seeds: tuple[int, ...] = setting((0,), "seeds trained in lockstep: 3, 0-9 or 1,4,7", key="seed")
     steps: int = setting(0, "environment steps of each seed", AT_LEAST_ONE)
     # Hyperparameters of the paper's table "Hyperparameters used in the experiments".
-    gamma: float = setting(0.99, "discount factor", Rule(lambda value: 0 <= value <= 1, "must be in [0, 1]"))
+    gamma: float = setting(0.99, "discount factor", SHARE)
     hidden: list[int] = setting(
         [400, 300], "hidden layer widths", Rule(lambda value: min(value) >= 1, "must list positive widths")
     )

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from plots.grouping import DAGGER, Groups, all_with, count_diverged, settings_without, shared_settings
-from plots.paper import order_algos
+from plots.paper import first_beyond, order_algos
 from plots.statistics import (
     CONFIDENCE,
     Estimate,
@@ -25,7 +25,7 @@ from plots.statistics import (
     performance_profile,
     probability_of_improvement,
 )
-from plots.style import color_of, line_of, plain, save
+from plots.style import color_of, legend_handles, line_of, plain, save
 from tables import MISSING, Table, TableCell, text_cells
 
 INTERVAL = f"{100 * CONFIDENCE:.0f} % interval"
@@ -161,6 +161,8 @@ def _mean_figure(aggregate: Aggregates, own: Sequence[str]) -> Figure:
             profile = performance_profile(aggregate.scores[algo], thresholds)
             right.plot(thresholds, profile.value, label=aggregate.label(algo), **line_of(algo, own, len(thresholds)))
             right.fill_between(thresholds, profile.low, profile.high, color=color_of(algo, own), alpha=0.12, lw=0)
+        if place := first_beyond(algos):
+            left.axhline(place - 0.5, color="gray", linewidth=0.8)
         left.set_yticks(range(len(algos)), [aggregate.label(algo) for algo in algos])
         left.set_ylim(len(algos) - 0.5, -0.5)
         left.set_xlabel(f"Interquartile mean of the scores, {INTERVAL}")
@@ -168,7 +170,8 @@ def _mean_figure(aggregate: Aggregates, own: Sequence[str]) -> Figure:
         right.set_ylabel("Runs above the score")
         right.set_ylim(0.0, 1.02)
         right.yaxis.set_major_formatter(PercentFormatter(1.0))
-        right.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
+        handles = legend_handles(right, algos)
+        right.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
         for axes in (left, right):
             plain(axes)
     figure.suptitle(", ".join(filter(None, ("Aggregate over tasks", aggregate.settings))))

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from itertools import groupby
 from typing import Any
 
-from algos import ALGORITHMS, setting_keys
+from algos import ALGORITHMS, PAPER, setting_keys
 from core.config import RUN_KEYS, keys_of
 from envs.tasks import TASKS, Task
 from tables import MISSING, Table, TableCell, text_cells
@@ -33,7 +33,7 @@ def task_table(tasks: Mapping[str, Task] = TASKS) -> Table:
 def hyperparameter_table() -> Table:
     """The paper's Table "Hyperparameters used in the experiments", then the constants that it leaves to its sources."""
     columns = _configurations()
-    tables = [algorithm.agent.paper for algorithm in ALGORITHMS.values()]
+    tables = [ALGORITHMS[name].agent.paper for name in PAPER]
     in_paper = {key for table in tables for settings in table.values() for key in settings}
     published: list[list[TableCell]] = []
     further: list[list[TableCell]] = []

@@ -20,7 +20,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
 
 from plots.grouping import DAGGER, Condition, Groups, count_diverged, order_conditions, setting_text
 from plots.paper import PAPER_SEEDS, order_algos
-from plots.style import line_of, plain, save
+from plots.style import legend_handles, line_of, plain, save
 from store.folder import Run
 
 LOGARITHMIC = ("temperature", "critic_loss")
@@ -80,7 +80,7 @@ def _draw_condition(
         _draw_curve(axes, learning_curve(by_algo[algo]), line | {"label": _legend(algo, by_algo[algo])})
     _label_axes(axes, "Evaluation return (mean ± standard error)")
     axes.set_title(fill(condition.label, 60))
-    figure.legend(loc="outside right upper", frameon=False)
+    figure.legend(handles=legend_handles(axes, evaluated), loc="outside right upper", frameon=False)
     return save(figure, folder, condition.label.replace(", ", ","), formats)
 
 

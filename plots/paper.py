@@ -1,9 +1,9 @@
-"""The paper's algorithms in order, their colours here, and its table of rewards."""
+"""The paper's algorithms and later methods in order, their colours here, and the paper's table of rewards."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +25,10 @@ COLORS = {
     "SRad": "#222222",
 }
 FAMILIES = {"TD3 family": list(COLORS)[:9], "SAC family": list(COLORS)[9:]}
+LATER = {"DGauge": "#b5a100", "SGauge": "#ff6f61", "ARAM": "#7f00ff"}
+"""The colours of the methods here that are not the paper's. Tables and figures have them apart, after the paper's."""
+BEYOND = "beyond the paper"
+"""The heading above these methods and those of one's own."""
 # Without constraints a penalty is zero and a projection the identity, so the paper trains one of each family.
 UNCONSTRAINED = "R+N"
 SAME_WITHOUT_CONSTRAINT = dict.fromkeys(("DPro+", "DPre", "DPre+", "DOpt", "DOpt+"), "DPro") | {"SPre+": "SPre"}
@@ -56,8 +60,17 @@ def order_tasks(names: Iterable[str]) -> list[str]:
 
 
 def order_algos(names: Iterable[str]) -> list[str]:
-    """The algorithms in the paper's order, other ones last; those with a label follow the one without."""
-    return _order(names, COLORS)
+    """The algorithms in the paper's order, then `LATER`, then other ones; those with a label follow the one without."""
+    return _order(names, [*COLORS, *LATER])
+
+
+def first_beyond(ordered: Sequence[str]) -> int | None:
+    """The place in `ordered` (`order_algos`) of the first algorithm that is not the paper's.
+
+    None where all or none of them are the paper's, so that there are no two groups.
+    """
+    papers = sum(unlabelled(name) in COLORS for name in ordered)
+    return papers if 0 < papers < len(ordered) else None
 
 
 def _order(names: Iterable[str], known: Iterable[str]) -> list[str]:

@@ -18,6 +18,7 @@ from plots.grouping import (
     shared_settings,
 )
 from plots.paper import (
+    BEYOND,
     DEFAULT_BATCH,
     FAMILIES,
     PAPER_SEEDS,
@@ -94,7 +95,7 @@ def reward_table(groups: Groups, beside: bool = False) -> Table:
             spans[name] = count
     # The others stand last (order_algos). With no heading, they would seem to be of neither family.
     if others := len(header) - 1 - sum(spans.values()):
-        spans["beyond the paper"] = others
+        spans[BEYOND] = others
     return Table("rewards", title, header, 1, sections, records, spans)
 
 

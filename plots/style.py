@@ -11,14 +11,12 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from plots.paper import COLORS, FAMILIES
+from plots.paper import BEYOND, COLORS, FAMILIES, LATER, first_beyond
 from store.folder import LONGEST_NAME
 
 FORMATS = ("png", "pdf")
-LATER = {"DGauge": ("#b5a100", "solid"), "SGauge": ("#ff6f61", "dashed")}
-"""Colours and lines of methods that are newer than the paper."""
-
 
 OWN_COLORS = (
     "#0000ff",
@@ -43,21 +41,28 @@ def own_algos(algos: Iterable[str]) -> list[str]:
 
 def color_of(algo: str, own: Sequence[str]) -> str:
     """The colour of `algo`; `own` are the algorithms of one's own in the folder of results (`own_algos`)."""
-    if algo in LATER:
-        return LATER[algo][0]
-    return COLORS.get(algo) or OWN_COLORS[own.index(algo) % len(OWN_COLORS)]
+    return (COLORS | LATER).get(algo) or OWN_COLORS[own.index(algo) % len(OWN_COLORS)]
 
 
 def line_of(algo: str, own: Sequence[str], points: int) -> dict[str, Any]:
     """Keywords of a line through so many points; `own` as in `color_of`."""
-    if algo in LATER:
-        line: Any = LATER[algo][1]
-    elif algo in COLORS:
-        line = "dashed" if algo in FAMILIES["SAC family"] else "solid"
+    if algo in COLORS or algo in LATER:
+        line: Any = "dashed" if algo in (*FAMILIES["SAC family"], "SGauge", "ARAM") else "solid"
     else:
         line = OWN_LINES[own.index(algo) // len(OWN_COLORS) % len(OWN_LINES)]
     marker = "." if 0 < points < 20 else ""
     return {"color": color_of(algo, own), "linestyle": line, "linewidth": 1.5, "marker": marker}
+
+
+def legend_handles(axes: Axes, algos: Sequence[str]) -> list[Any]:
+    """The handles of a legend of `axes`, whose labelled lines are those of `algos` in the order of `order_algos`.
+
+    A heading stands above the algorithms that are not the paper's.
+    """
+    handles = axes.get_legend_handles_labels()[0]
+    if place := first_beyond(algos):
+        handles.insert(place, Line2D([], [], linestyle="none", label=BEYOND))
+    return handles
 
 
 def plain(axes: Axes) -> None:

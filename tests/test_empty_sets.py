@@ -91,6 +91,7 @@ class GapAfter:
     [
         ("DRad", "start"),
         ("SPre+", "start"),
+        ("ARAM", "start"),
         ("DGauge", "batch"),
         ("SAlpha", "batch"),
         ("NFW", "batch"),

@@ -46,6 +46,8 @@ def make(name, task="W+M", device="cpu"):
             reward, terminated = torch.randn(2, 1, generator=generator), torch.zeros(2, 1)
             centers = agent.centers(obs), agent.centers(next_obs)
             replay.add([0, 1], Batch(obs, action, reward, terminated, next_obs, *centers))
+            if name == "ARAM" and device != "meta":  # it has a second buffer
+                agent.remember([0, 1], obs, uniform.unsqueeze(1), torch.tensor([1, 1]))
 
     grow(20)
     return agent, replay, grow
@@ -134,7 +136,7 @@ def cuda_stand_in(monkeypatch):
     return Steps
 
 
-@pytest.mark.parametrize("name", ["DPre+", "DRad", "NFW", "SPre", "SAlpha"])
+@pytest.mark.parametrize("name", ["DPre+", "DRad", "NFW", "SPre", "SAlpha", "ARAM"])
 @pytest.mark.parametrize("block", [4, core.ahead.BLOCK])
 def test_repeated_steps_draw_the_numbers_of_eager_ones(name, block, cuda_stand_in, monkeypatch):
     monkeypatch.setattr(core.ahead, "BLOCK", block)
@@ -201,7 +203,9 @@ def explored(agent, calls, device="cpu"):
 
 
 @needs_cuda
-@pytest.mark.parametrize("name, task", [("DPre", "W+M"), ("DRad", "R+L2"), ("SPre", "W+M"), ("SRad", "R+L2")])
+@pytest.mark.parametrize(
+    "name, task", [("DPre", "W+M"), ("DRad", "R+L2"), ("SPre", "W+M"), ("SRad", "R+L2"), ("ARAM", "W+M")]
+)
 def test_exploration_on_a_gpu_is_repeated_as_a_graph(name, task):
     here, there = make(name, task)[0], make(name, task, "cuda")[0]
     expected, found = explored(here, 3 * EAGER_CALLS), explored(there, 3 * EAGER_CALLS, "cuda")
@@ -231,7 +235,7 @@ def test_cuda_learns_what_the_cpu_learns_and_never_waits(name, task, monkeypatch
 
 
 @needs_cuda
-@pytest.mark.parametrize("name", ["DPre", "SRad"])
+@pytest.mark.parametrize("name", ["DPre", "SRad", "ARAM"])
 def test_a_run_on_a_gpu_is_interrupted_and_resumed_with_the_same_bits(name, tmp_path):
     words = f"algo={name} env=W+M seed=0,1 steps=300 learning_starts=100 train_freq=20 gradient_steps=20 device=cuda"
     words += " hidden=[16,16] batch_size=16 eval_every=100 eval_episodes=1 final_episodes=1"

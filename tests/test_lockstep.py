@@ -56,6 +56,7 @@ CASES = {
     "TD3 on Walker2d": ("DAlpha", "W+M"),
     "SAC on Walker2d": ("SAlpha", "W+O+S"),
     "SAC with stored centres": ("SRad", "W+M"),
+    "ARAM": ("ARAM", "R+L2"),
 }
 
 

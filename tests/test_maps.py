@@ -8,6 +8,7 @@ import torch
 from helpers import config_of, run_command
 
 from algos import ALGORITHMS, PAPER, Algorithm, paper_settings, saved_config, setting_keys
+from algos.aram import ARAM
 from algos.nfwpo import NFWPO
 from algos.sac import SAC
 from algos.td3 import TD3
@@ -142,6 +143,7 @@ def test_the_entropy_in_unit_ball_coordinates_is_a_setting_of_the_map():
         (TD3, Project(), "wrapper", "unknown placement 'wrapper'"),
         (NFWPO, Project(), "layer", "NFWPO is implemented for placement rollout, not layer"),
         (NFWPO, Radial(), "rollout", "NFWPO is implemented for Project, not Radial"),
+        (ARAM, Project(), "rollout", "ARAM is implemented for placement environment, not rollout"),
         (TD3, Bare, "layer", "map must be an object such as Bare(), got the class"),
         (TD3, "Alpha", "layer", "TD3 is implemented for Map, not str"),
     ],
@@ -181,7 +183,7 @@ def test_an_agent_that_is_not_complete_is_refused_with_what_is_missing():
 
 def test_what_is_accepted_is_what_the_table_has_and_no_more():
     accepted = set()
-    for agent in (TD3, SAC, NFWPO):
+    for agent in (TD3, SAC, NFWPO, ARAM):
         for map in ALL_MAPS:
             for placement in ("environment", "rollout", "layer"):
                 try:

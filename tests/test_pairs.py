@@ -16,6 +16,8 @@ SHORT = ["learning_starts=20", "batch_size=8", "hidden=[16,16]", "eval_episodes=
 def settings(algo, task):
     """A short run with gradient steps: where TD3 waits for the end of an episode, one that ends soon or none."""
     robot = TASKS[task].robot.__name__
+    if algo == "ARAM":
+        return {"steps": 40, "snapshots_after": 0, "snapshot_every": 5}
     if ALGORITHMS[algo].agent.family == "SAC" or robot == "Hopper":
         return {"steps": 40}
     # An episode of HalfCheetah is 1,000 steps: too long for thirteen algorithms twice.

@@ -16,7 +16,7 @@ from helpers import refused_by_plot, run_command
 import envs
 import plot
 import tables
-from algos import ALGORITHMS
+from algos import ALGORITHMS, PAPER
 from plots import definitions, illustrations, runtime
 from store.folder import read_run
 
@@ -137,13 +137,15 @@ def test_hyperparameter_table():
     assert values["action_noise", "Others", "SAC"] is None and values["policy_delay", "Hopper", "TD3"] == 2
     assert values["penalty", "Reacher", "SAC"] == 1.0 and values["final_episodes", "Hopper", "TD3"] == 50
     published, further = ({row[0].lines[0]: [cell.lines[0] for cell in row] for row in s} for s in table.sections)
-    assert set(published) == {key for agent in agents for settings in agent.paper.values() for key in settings}
+    paper = [ALGORITHMS[name].agent.paper for name in PAPER]
+    assert set(published) == {key for table in paper for settings in table.values() for key in settings}
+    assert further["reward_shift"][2:] == ["–", "–", "0.2", "–", "–", "0.0", "–", "–", "0.0"]
     assert "policy_delay" in further and not {"seed", "results", "steps"} & set(further)
-    assert published["hidden"][2:] == ["400, 300"] * 3 + ["256, 256", "400, 300", "256, 256"]
-    assert published["gsde"][2:] == ["–", "True", "–", "False", "–", "False"]
+    assert published["hidden"][2:] == ["400, 300"] * 4 + ["256, 256"] * 2 + ["400, 300"] + ["256, 256"] * 2
+    assert published["gsde"][2:] == ["–", "True", "–", "–", "False", "–", "–", "False", "–"]
     latex = tables.to_latex(table)
-    assert r"\multicolumn{2}{c}{Reacher} & \multicolumn{2}{c}{Hopper} & \multicolumn{2}{c}{Others}" in latex
-    assert "Setting & Meaning & TD3 & SAC & TD3 & SAC & TD3 & SAC" in latex
+    assert r"\multicolumn{3}{c}{Reacher} & \multicolumn{3}{c}{Hopper} & \multicolumn{3}{c}{Others}" in latex
+    assert "Setting & Meaning & TD3 & SAC & ARAM & TD3 & SAC & ARAM & TD3 & SAC & ARAM" in latex
 
 
 # ---- runtime ----

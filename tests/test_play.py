@@ -48,7 +48,9 @@ def assert_equal(one, other):
 # ---------------------------------------------------------------- load_policy
 
 
-@pytest.mark.parametrize("algo, task", [("DRad", "R+M"), ("DPre", "R+T"), ("SAlpha", "R+L2"), ("SGauge", "R+O10")])
+@pytest.mark.parametrize(
+    "algo, task", [("DRad", "R+M"), ("DPre", "R+T"), ("SAlpha", "R+L2"), ("SGauge", "R+O10"), ("ARAM", "R+L2")]
+)
 def test_the_policy_is_the_one_that_the_run_was_judged_by(algo, task, tmp_path):
     train(tmp_path, f"algo={algo} env={task} seed=3 {SHORT}")
     (folder,) = find_runs(tmp_path)

@@ -7,9 +7,10 @@ import pytest
 from helpers import refused_by_plot, write_run
 
 import plot
+from algos import ALGORITHMS, PAPER
 from plots import aggregates, figures, style
 from plots.grouping import group_runs
-from plots.paper import COLORS
+from plots.paper import COLORS, LATER, first_beyond, order_algos
 from plots.rewards import comparison_table, reward_table
 from store.folder import read_results
 
@@ -37,11 +38,12 @@ def failed_run(root, task, algo, seed, result):
 
 def test_own_algorithms_can_be_told_apart(tmp_path, drawn):
     names = [f"Mine{i}" for i in range(30)]
-    own = style.own_algos([*names, "SRad", "DGauge"])
+    own = style.own_algos([*names, "SRad", *LATER])
     assert own == sorted(names)
     looks = {(line["color"], line["linestyle"]) for line in (style.line_of(name, own, 100) for name in names)}
     assert len(looks) == 30 and len({style.color_of(name, own) for name in names[:10]}) >= 8
-    taken = {*COLORS.values(), *(color for color, _ in style.LATER.values())}
+    taken = {*COLORS.values(), *LATER.values()}
+    assert len(taken) == len(COLORS) + len(LATER)
     assert not taken & set(style.OWN_COLORS) and len(set(style.OWN_COLORS)) == len(style.OWN_COLORS)
     for task, algos in {"R+L2": ("Mine", "Other", "SRad"), "R+N": ("Other", "Zeta")}.items():
         for algo in algos:
@@ -57,6 +59,25 @@ def test_own_algorithms_can_be_told_apart(tmp_path, drawn):
     lines = [line for axes in drawn["aggregate"].axes for line in axes.lines]
     profiles = {line.get_label(): line.get_color() for line in lines}
     assert profiles["Mine"] == colors[0]["Mine"]
+
+
+def test_methods_beyond_the_paper_stand_apart_after_the_papers(tmp_path, drawn):
+    names = ["DPre", "SRad", "DGauge", "SGauge", "ARAM", "A"]
+    assert {*COLORS, *LATER} == {*ALGORITHMS} and list(COLORS) == list(PAPER)
+    assert order_algos(reversed(names)) == names
+    assert first_beyond(names) == 2 and first_beyond(names[:2]) is None and first_beyond(names[2:]) is None
+    for algo in names:
+        for seed in range(2):
+            write_run(tmp_path, "R+L2", algo, seed, result=1.0 + seed)
+    assert plot.main([str(tmp_path)]) == 0
+    groups = group_runs(read_results(tmp_path)[0])[0]
+    assert reward_table(groups).spans == {"TD3 family": 1, "SAC family": 1, "beyond the paper": 4}
+    legend = [text.get_text().split(" (")[0] for text in drawn["R+L2"].legends[0].get_texts()]
+    assert legend == ["DPre", "SRad", "beyond the paper", *names[2:]]
+    means, profiles = drawn["aggregate"].axes
+    texts = [text.get_text() for text in profiles.get_legend().get_texts()]
+    assert texts == ["DPre", "SRad", "beyond the paper", *names[2:]]
+    assert any(set(line.get_ydata()) == {1.5} for line in means.lines)
 
 
 def test_the_comparison_lists_own_algorithms_beside_the_papers(tmp_path):

@@ -17,6 +17,7 @@ CASES = {
     "SAC with stored centres": "algo=SAlpha env=W+M",
     "NFWPO on Reacher": "algo=NFW env=R+L2",
     "NFWPO on Walker2d": "algo=NFW env=W+O+S",
+    "ARAM": "algo=ARAM env=R+L2 rejected_kept=50 snapshots_after=10 snapshot_every=20",
     "a ring that wraps": "algo=SPre env=R+T buffer_size=77",
 }
 

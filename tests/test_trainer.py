@@ -324,13 +324,15 @@ def test_the_buffer_has_suggestions_where_the_environment_maps_and_executed_acti
     config.eval_episodes = config.final_episodes = 1
     if name.startswith("D") or name == "NFW":
         config.action_noise = 1.0
+    if name == "ARAM":
+        config.most_rejections = 1  # so that it projects what it rejects
     agent = algorithm.build(config, CONSTRAINT, OBS, [4])
     trainer = make_trainer(tmp_path, agent=agent)
     trainer.run()
     obs, stored, *_ = transitions(trainer)
     executed = torch.from_numpy(np.stack(trainer.seeds[0].env.executed))
     assert CONSTRAINT.violation(obs, executed).max() <= 1e-6
-    if name in ("DPre", "DPre+", "SPre", "SPre+"):
+    if name in ("DPre", "DPre+", "SPre", "SPre+", "ARAM"):
         for part in (slice(0, 20), slice(20, 40)):  # warm-up, training
             assert (CONSTRAINT.violation(obs[part], stored[part]) > 0.01).any()
         torch.testing.assert_close(CONSTRAINT.project(obs, stored), executed)

@@ -104,7 +104,7 @@ class ARAM(Agent):
         self.actor_optimizer = Adam(self.actor.parameters(), config.learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), config.learning_rate)
         self.temperature_optimizer = Adam(self.temperature.parameters(), config.learning_rate)
-        self.explored = Captured(self.suggestions)
+        self.explored = Captured(self.suggestions, self.device)
         self.target_entropy = -float(self.action_dim)
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:

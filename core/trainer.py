@@ -197,7 +197,8 @@ class Trainer:
             exploring = [seed.position for seed in seeds if seed.steps >= starts]
             action = self.agent.act(self.obs, self.center, warming_up, exploring)
             if measured := [seed for seed in seeds if seed.position in exploring and seed.is_measured]:
-                violations = self.agent.constraint.violation(self.obs, self.agent.bounded(action.suggested)).tolist()
+                proposed = self.agent.proposed(self.obs, action.suggested)
+                violations = self.agent.constraint.violation(self.obs, proposed).tolist()
                 for seed in measured:
                     seed.suggestions.add(violations[seed.position])
             self._fail_refused()

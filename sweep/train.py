@@ -30,6 +30,7 @@ from sweep.cells import Cell, make_cells
 from sweep.check import check_training
 from sweep.definition import changed_runs, define, refuse
 from sweep.exit import Exit, stoppable
+from sweep.flows import flow_of
 from sweep.plugins import load_plugins, refuse_to_train_in_plugin
 
 
@@ -101,6 +102,9 @@ def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Call
                 _resume(cell, folders, group, ended, info, definition, stop_if_asked)
         if fresh:
             info["lockstep"] = fresh
+            flow = flow_of(config, definition, stop_if_asked)
+            if flow is not None:
+                info["flow"] = flow["measures"]
             writers = [
                 RunWriter(
                     folders[seed],
@@ -112,7 +116,10 @@ def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Call
                 )
                 for seed in fresh
             ]
-            _run(make_trainer(config, fresh, writers, True, stop_if_asked))
+            trainer = make_trainer(config, fresh, writers, True, stop_if_asked)
+            if flow is not None:
+                trainer.agent.map.load_state(flow["state"])
+            _run(trainer)
         return not any(has_failed(folder) for folder in folders.values())
 
 

@@ -126,8 +126,7 @@ class Flow(Map):
     """A trained flow, and the projection of what it leaves outside the set.
 
     The suggestion is a point of the box, which the flow decodes. The log-density is that of the decoded action, before
-    the projection. Before it acts, it needs a flow: from `core.flow_training`, with `load_state` of the state of a map
-    that has one, or with `use_untrained`. RuntimeError without one.
+    the projection. `load_state` gives it a flow that `core.flow_training` has trained; RuntimeError before that.
     """
 
     flow: str = setting(
@@ -170,18 +169,15 @@ class Flow(Map):
         return ConditionalFlow(dim, features, self.flow_width, torch.Generator().manual_seed(0))
 
     def use_untrained(self, constraint: Constraint, obs: Tensor) -> None:
-        self.use(self.new_network(constraint.dim, constraint.features(obs).shape[-1]))
-
-    def use(self, network: ConditionalFlow) -> None:
-        """Take a copy of a flow."""
-        self._networks = {CPU: copy.deepcopy(network).requires_grad_(False)}
+        self._take(self.new_network(constraint.dim, constraint.features(obs).shape[-1]))
 
     def state(self) -> dict[str, Tensor]:
-        return {name: value.clone() for name, value in self._on(CPU).state_dict().items()}
+        networks = [self._networks[CPU]] if self._networks else []
+        return {name: value.clone() for network in networks for name, value in network.state_dict().items()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         if not self._networks:
-            self.use(self.new_network(len(state["action_mean"]), len(state["feature_mean"])))
+            self._take(self.new_network(len(state["action_mean"]), len(state["feature_mean"])))
         for network in self._networks.values():
             network.load_state_dict(state)
 
@@ -190,10 +186,13 @@ class Flow(Map):
         action, log_det = self._on(obs.device).decode(constraint.features(obs), suggested)
         return action.to(suggested.dtype), log_det.to(suggested.dtype)
 
+    def _take(self, network: ConditionalFlow) -> None:
+        self._networks = {CPU: network.requires_grad_(False)}
+
     def _on(self, device: torch.device) -> ConditionalFlow:
         """The flow on a device."""
         if not self._networks:
-            raise RuntimeError("this map has no flow yet: load the state of one that is trained, or use_untrained")
+            raise RuntimeError("this map has no flow yet: sweep.flows trains one, and load_state takes it")
         if device not in self._networks:
             self._networks[device] = copy.deepcopy(self._networks[CPU]).to(device)
         return self._networks[device]

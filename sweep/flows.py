@@ -165,7 +165,10 @@ def _train(config: Config, flow: Flow, folder: FlowFolder, stop_if_asked: Callab
 
         def checkpoint() -> None:
             seconds = time.perf_counter() - started
-            folder.save("checkpoint", {"training": training.state(), "rows": rows, "seconds": seconds})
+            try:
+                folder.save("checkpoint", {"training": training.state(), "rows": rows, "seconds": seconds})
+            except OSError as error:
+                tqdm.write(f"no checkpoint of the flow at step {training.step}: {one_line(error)}", file=sys.stderr)
 
         saved = time.perf_counter()
         try:

@@ -66,6 +66,7 @@ class ConditionalFlow(nn.Module):
     def __init__(self, dim: int, features: int, width: int, generator: torch.Generator):
         super().__init__()
         self.middle = dim // 2
+        self.shifts = [number // 2 if dim > 2 else 0 for number in range(COUPLINGS)]
         sizes = (self.middle, dim - self.middle)
         self.couplings = nn.ModuleList(
             Coupling(*(sizes if number % 2 == 0 else sizes[::-1]), features, width, generator)
@@ -113,12 +114,17 @@ class ConditionalFlow(nn.Module):
         return lead, x.reshape(lead.numel(), x.shape[-1]), standard.reshape(lead.numel(), standard.shape[-1])
 
     def _split(self, number: int, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The coordinates that a coupling is given, and those that it moves: the two halves take turns."""
+        """The coordinates that a coupling is given, and those that it moves.
+
+        Two halves take turns. Which coordinates are neighbours in a half changes after each two couplings.
+        """
+        x = x.roll(-self.shifts[number], -1)
         first, second = x[:, : self.middle], x[:, self.middle :]
         return (first, second) if number % 2 == 0 else (second, first)
 
     def _join(self, number: int, given: Tensor, moved: Tensor) -> Tensor:
-        return torch.cat((given, moved) if number % 2 == 0 else (moved, given), -1)
+        """The coordinates (batch, d) in their order."""
+        return torch.cat((given, moved) if number % 2 == 0 else (moved, given), -1).roll(self.shifts[number], -1)
 
 
 @dataclass
@@ -130,21 +136,26 @@ class Flow(Map):
     """
 
     flow: str = setting(
-        "mle",
+        "reverse",
         "DFlow, SFlow: how the flow is trained, mle (as FlowPG) or reverse (as CV-Flow)",
         one_of("mle", "reverse"),
     )
     flow_width: int = setting(64, "DFlow, SFlow: units in a hidden layer of the flow", AT_LEAST_ONE)
-    flow_steps: int = setting(10_000, "DFlow, SFlow: gradient steps of the flow's training", AT_LEAST_ONE)
+    flow_steps: int = setting(3_000, "DFlow, SFlow: gradient steps of the flow's training", AT_LEAST_ONE)
     flow_batch_size: int = setting(256, "DFlow, SFlow: samples in such a step", AT_LEAST_ONE)
     flow_learning_rate: float = setting(1e-3, "DFlow, SFlow: Adam's at the start; a cosine takes it to 0", POSITIVE)
-
     mle_softness: float = setting(0.02, "DFlow, SFlow: width of the box's edges, for flow=mle", POSITIVE)
     reverse_softness: float = setting(2e-4, "DFlow, SFlow: width of the set's edges, for flow=reverse", POSITIVE)
 
+    flow_entropy: str = setting(
+        "action",
+        "SFlow: entropy of the 'action', or of the 'latent' point of the box as in CV-Flow",
+        one_of("action", "latent"),
+        of_density=True,
+    )
+
     squashes = True
     needs_center = False
-    placements = ("layer",)
 
     def __post_init__(self) -> None:
         self._networks: dict[torch.device, ConditionalFlow] = {}  # the flow on each device that has asked for it
@@ -156,7 +167,8 @@ class Flow(Map):
         self, constraint: Constraint, obs: Tensor, sample: Sample, center: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         action, log_det = self._decode(constraint, obs, sample.suggested)
-        return constraint.project(obs, action), sample.log_prob - log_det
+        latent = self.flow_entropy == "latent"
+        return constraint.project(obs, action), sample.log_prob if latent else sample.log_prob - log_det
 
     def propose(self, constraint: Constraint, obs: Tensor, suggested: Tensor) -> Tensor:
         return self._decode(constraint, obs, suggested)[0]

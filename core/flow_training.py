@@ -7,7 +7,7 @@ With x the point of the box, a the action and s the state:
 - `reverse`, as CV-Flow: points x are uniform in the box, a = decode(x | s), and the loss is -log |det da/dx| plus the
   violation of a in units of `reverse_softness`: the Kullback-Leibler divergence to a set with soft edges.
 
-States are those of random play, and some further out: a trained policy moves faster.
+States are those of random play, moved towards their mean or away from it (`FURTHEST`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ from core.snapshot import parameters_of
 POOL = 100_000
 """States of a training, each with an action that is uniform in its set for `mle`."""
 HELD_OUT = 4_000
-"""States of random play that a training does not see, for the measures."""
+"""The number of states, of parts of random play that the training does not use, for the measures."""
+FURTHEST = 4.0
+"""Times as far from their mean as in random play, at most: a trained policy moves faster."""
 SCALING = 1_000
 """Actions from which the flow takes its scales."""
 LARGEST_STEP = 0.1
@@ -54,26 +56,29 @@ class FlowTraining:
         self.flow, self.constraint = flow, constraint
         self.generator = torch.Generator().manual_seed(1)
         self.step = 0
-        known, self.seen = obs[:-HELD_OUT], obs[-HELD_OUT:]
-        self.obs = self._further_out(known)
+        self.obs = self._further_out(obs[:-HELD_OUT], POOL)
+        self.test_obs = self._further_out(obs[-HELD_OUT:], HELD_OUT)
         self.features = constraint.features(self.obs).float()
         self.actions = self._feasible(self.obs if flow.flow == "mle" else self.obs[:SCALING], stop_if_asked)
-        self.seen_actions = self._feasible(self.seen, stop_if_asked)
+        self.test_actions = self._feasible(self.test_obs, stop_if_asked)
         self.network = flow.new_network(constraint.dim, self.features.shape[-1])
         self.network.standardize(self.features, self.actions)
         self.optimizer = Adam(self.network.parameters(), flow.flow_learning_rate)
         self.parameters = parameters_of(self.optimizer)
 
-    def _further_out(self, obs: Tensor) -> Tensor:
-        """`POOL` states: some of `obs`, 0 to 2 times as far from their mean. Where the set breaks down there: `obs`."""
-        some = obs[torch.randint(len(obs), (POOL,), generator=self.generator)]
+    def _further_out(self, obs: Tensor, count: int) -> Tensor:
+        """`count` of obs (n, k), moved to 0 to `FURTHEST` times their distance from the mean of all.
+
+        Where the set breaks down there, they stay where they are.
+        """
+        some = obs[torch.randint(len(obs), (count,), generator=self.generator)]
         mean = obs.mean(0)
-        scaled = mean + 2.0 * torch.rand(POOL, 1, generator=self.generator) * (some - mean)
+        moved = mean + FURTHEST * torch.rand(count, 1, generator=self.generator) * (some - mean)
         try:
-            self.constraint.center(scaled)
+            self.constraint.center(moved)
         except ConstraintError:  # a set of one's own need not exist where the robot cannot be
             return some
-        return scaled
+        return moved
 
     def _feasible(self, obs: Tensor, stop_if_asked: Callable[[], None]) -> Tensor:
         """An action (n, d) for each of obs (n, k), uniform in its set.
@@ -127,16 +132,16 @@ class FlowTraining:
 
     @torch.no_grad()
     def measure(self) -> dict[str, float]:
-        """How good the flow is at states of random play that it has not seen, with the same random numbers each time.
+        """How good the flow is at other states of the same kind, with the same random numbers each time.
 
         `accuracy` is the share of uniform points of the box that it decodes to feasible actions, `recall` that of
         uniform feasible actions that it encodes into the box, and `violation` the mean violation of decoded actions,
         where a feasible one counts as 0.
         """
-        features = self.constraint.features(self.seen)
-        x = 2.0 * torch.rand(self.seen_actions.shape, generator=torch.Generator().manual_seed(2)) - 1.0
-        violation = self.constraint.violation(self.seen, self.network.decode(features, x)[0])
-        encoded = self.network.encode(features, self.seen_actions)[0]
+        features = self.constraint.features(self.test_obs)
+        x = 2.0 * torch.rand(self.test_actions.shape, generator=torch.Generator().manual_seed(2)) - 1.0
+        violation = self.constraint.violation(self.test_obs, self.network.decode(features, x)[0])
+        encoded = self.network.encode(features, self.test_actions)[0]
         return {
             "accuracy": (violation <= _FEASIBLE).double().mean().item(),
             "recall": (encoded.abs().amax(-1) <= 1.0).double().mean().item(),

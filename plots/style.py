@@ -16,7 +16,12 @@ from plots.paper import COLORS, FAMILIES
 from store.folder import LONGEST_NAME
 
 FORMATS = ("png", "pdf")
-LATER = {"DGauge": ("#b5a100", "solid"), "SGauge": ("#ff6f61", "dashed")}
+LATER = {
+    "DGauge": ("#b5a100", "solid"),
+    "SGauge": ("#ff6f61", "dashed"),
+    "DFlow": ("#4b6cb7", "solid"),
+    "SFlow": ("#2e8b57", "dashed"),
+}
 """Colours and lines of methods that are newer than the paper."""
 
 

@@ -63,7 +63,8 @@ class FlowFolder:
     """The folder of the flow of `config`; `task` describes its task, as definition.json does."""
 
     def __init__(self, config: Config, flow: Flow, task: Description):
-        settings = {"version": VERSION, "flow": asdict(flow), "task": task}
+        of_training = {name: value for name, value in asdict(flow).items() if name != "flow_entropy"}
+        settings = {"version": VERSION, "flow": of_training, "task": task}
         self.settings = json.dumps(settings, indent=2, sort_keys=True) + "\n"
         digest = hashlib.sha256(self.settings.encode()).hexdigest()[:12]
         self.path = Path(config.results).expanduser() / FOLDER / config.env / f"{flow.flow}-{digest}"

@@ -10,7 +10,7 @@ import torch
 from helpers import CHECKPOINTED, outcome, train
 from hypothesis import settings
 
-from algos import ALGORITHMS
+from algos import ALGORITHMS, Algorithm
 from core import flow_training
 from sweep import flows
 
@@ -42,5 +42,6 @@ def small_flows(monkeypatch):
     monkeypatch.setattr(flows, "STATES", 400)
     monkeypatch.setattr(flow_training, "HELD_OUT", 100)
     monkeypatch.setattr(flow_training, "POOL", 500)
-    for name in ("DFlow", "SFlow"):
-        monkeypatch.setitem(vars(ALGORITHMS[name].map), "flow_steps", 20)
+    for algorithm in (ALGORITHMS["DFlow"], ALGORITHMS["SFlow"]):
+        monkeypatch.setitem(vars(algorithm.map), "flow_steps", 20)
+        monkeypatch.setitem(vars(algorithm), "config_class", Algorithm.config_class.func(algorithm))  # it is cached

@@ -132,6 +132,10 @@ def test_the_maps_density_is_the_suggestions_over_the_determinant():
     sample = Sample(suggested, torch.zeros(40, 2), torch.ones(40, 2), zero + 0.7)
     action, log_prob = map.with_log_prob(CONSTRAINT, obs, sample, None)
     torch.testing.assert_close(action, map(CONSTRAINT, obs, suggested, None))
+    latent = Flow(flow_entropy="latent", flow_width=8)
+    latent.load_state(map.state())
+    same, of_suggestion = latent.with_log_prob(CONSTRAINT, obs, sample, None)
+    assert torch.equal(same, action) and torch.equal(of_suggestion, sample.log_prob)
     for i in range(40):
         jacobian = torch.autograd.functional.jacobian(lambda u, i=i: map.propose(CONSTRAINT, obs[i], u), suggested[i])
         assert float(log_prob[i]) == pytest.approx(0.7 - float(torch.linalg.slogdet(jacobian).logabsdet), abs=1e-4)
@@ -228,7 +232,7 @@ def test_a_short_training_takes_nearly_all_of_the_box_into_the_set(how, constrai
 def test_samples_of_a_training_are_uniform():
     """The first feasible try, or, where all of them fail, `Constraint.sample`."""
     thin = WeightedL1(lambda obs: 0 * obs[..., :2] + torch.tensor([30.0, 1.0]), 0.3, 2)  # |30 a_1| + |a_2| <= 0.3
-    training = FlowTraining(Flow(), thin, states())
+    training = FlowTraining(Flow("mle"), thin, states())
     assert thin.violation(training.obs, training.actions).max() <= 0
     gauge = thin.gauge(training.obs, training.actions, None)
     assert gauge.square().mean() == pytest.approx(0.5, abs=0.02)  # gauge^2 is uniform in two dimensions

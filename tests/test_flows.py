@@ -67,7 +67,8 @@ def test_a_flow_is_trained_once_for_a_task_and_settings(tmp_path, monkeypatch):
         patched.setattr(flows, "FlowTraining", lambda *arguments: pytest.fail("trained again"))
         train(tmp_path, WORDS.replace("3,5", "5"))
         train(tmp_path, WORDS.replace("DFlow", "SFlow"))
-    train(tmp_path, f"{WORDS} flow=reverse")
+        train(tmp_path, WORDS.replace("DFlow", "SFlow") + " flow_entropy=latent")
+    train(tmp_path, f"{WORDS} flow=mle")
     train(tmp_path, f"{WORDS} flow_steps=21")
     assert len(flow_folders(tmp_path)) == 3
     monkeypatch.setattr(envs.TASKS["R+O10"].constraint, "bound", 0.9)  # its definition, which is all that counts
@@ -84,14 +85,14 @@ def test_what_a_training_leaves(tmp_path):
     assert rows[:, 0].tolist() == list(range(1, 21)) and (np.diff(rows[:, 1]) >= 0).all()
     assert ((rows[:, 2:4] > 0) & (rows[:, 2:4] <= 1)).all()
     settings = json.loads((folder / "settings.json").read_text())
-    assert settings["flow"]["flow"] == "mle" and settings["flow"]["flow_steps"] == 20
+    assert settings["flow"]["flow"] == "reverse" and settings["flow"]["flow_steps"] == 20
     for run in find_runs(tmp_path):
         assert json.loads((run / "info.json").read_text())["flow"]["accuracy"] == rows[-1, 2]
 
 
 def test_a_run_keeps_its_flow(tmp_path):
     """A policy needs the folder of the run and nothing else; training.csv tells how much is projected."""
-    train(tmp_path, f"{WORDS} flow=reverse")
+    train(tmp_path, f"{WORDS} flow=mle")
     obs = np.random.default_rng(0).normal(size=(40, 9))
     (run, _) = find_runs(tmp_path)
     before = load_policy(run)(obs)

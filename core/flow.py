@@ -145,7 +145,7 @@ class Flow(Map):
     flow_batch_size: int = setting(256, "DFlow, SFlow: samples in such a step", AT_LEAST_ONE)
     flow_learning_rate: float = setting(1e-3, "DFlow, SFlow: Adam's at the start; a cosine takes it to 0", POSITIVE)
     mle_softness: float = setting(0.02, "DFlow, SFlow: width of the box's edges, for flow=mle", POSITIVE)
-    reverse_softness: float = setting(2e-4, "DFlow, SFlow: width of the set's edges, for flow=reverse", POSITIVE)
+    reverse_softness: float = setting(1e-4, "DFlow, SFlow: width of the set's edges, for flow=reverse", POSITIVE)
 
     flow_entropy: str = setting(
         "action",

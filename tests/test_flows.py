@@ -59,6 +59,19 @@ def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path,
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
+def test_a_seed_learns_the_same_alone_and_in_lockstep(tmp_path):
+    """They share the flow, and nothing else."""
+    for root, seeds in (("together", "3,5"), ("alone", "5")):
+        train(tmp_path / root, SAC_WORDS.replace("3,5", seeds))
+    last = {}
+    for root in ("together", "alone"):
+        (run,) = (folder for folder in find_runs(tmp_path / root) if folder.name == "seed=5")
+        last[root] = torch.load(run / "last.pt", weights_only=True)
+    assert last["together"].keys() == last["alone"].keys() and any(name.startswith("map.") for name in last["alone"])
+    for name, value in last["alone"].items():
+        torch.testing.assert_close(last["together"][name], value, rtol=1e-3, atol=1e-3)
+
+
 def test_a_flow_is_trained_once_for_a_task_and_settings(tmp_path, monkeypatch):
     train(tmp_path, WORDS.replace("3,5", "3"))
     (folder,) = flow_folders(tmp_path)

@@ -56,8 +56,8 @@ class FlowTraining:
         self.flow, self.constraint = flow, constraint
         self.generator = torch.Generator().manual_seed(1)
         self.step = 0
-        self.obs = self._further_out(obs[:-HELD_OUT], POOL)
-        self.test_obs = self._further_out(obs[-HELD_OUT:], HELD_OUT)
+        self.obs = self._further_out(obs[:-HELD_OUT], POOL, stop_if_asked)
+        self.test_obs = self._further_out(obs[-HELD_OUT:], HELD_OUT, stop_if_asked)
         self.features = constraint.features(self.obs).float()
         self.actions = self._feasible(self.obs if flow.flow == "mle" else self.obs[:SCALING], stop_if_asked)
         self.test_actions = self._feasible(self.test_obs, stop_if_asked)
@@ -66,7 +66,7 @@ class FlowTraining:
         self.optimizer = Adam(self.network.parameters(), flow.flow_learning_rate)
         self.parameters = parameters_of(self.optimizer)
 
-    def _further_out(self, obs: Tensor, count: int) -> Tensor:
+    def _further_out(self, obs: Tensor, count: int, stop_if_asked: Callable[[], None]) -> Tensor:
         """`count` of obs (n, k), moved to 0 to `FURTHEST` times their distance from the mean of all.
 
         Where the set breaks down there, they stay where they are.
@@ -75,7 +75,9 @@ class FlowTraining:
         mean = obs.mean(0)
         moved = mean + FURTHEST * torch.rand(count, 1, generator=self.generator) * (some - mean)
         try:
-            self.constraint.center(moved)
+            for chunk in moved.split(_CHUNK):
+                stop_if_asked()
+                self.constraint.center(chunk)
         except ConstraintError:  # a set of one's own need not exist where the robot cannot be
             return some
         return moved

@@ -129,8 +129,11 @@ def flow_of(
                 if folder.read() is None:  # another process may have finished it since
                     _train(config, flow, folder, stop_if_asked)
         except LockedError as error:
-            tqdm.write(f"waiting: {error}", file=sys.stderr)
+            print(f"waiting: {error}", file=sys.stderr)
             _wait(folder, stop_if_asked)
+        except Interrupted:
+            print(f"interrupted in the training of {folder.path}; the same command resumes", file=sys.stderr)
+            raise
     if trained["measures"]["accuracy"] < GOOD:
         share = f"{100 * trained['measures']['accuracy']:.1f} %"
         print(
@@ -187,7 +190,6 @@ def _train(config: Config, flow: Flow, folder: FlowFolder, stop_if_asked: Callab
                     saved = time.perf_counter()
         except Interrupted:
             checkpoint()
-            tqdm.write(f"interrupted in the training of {folder.path}; the same command resumes", file=sys.stderr)
             raise
         except DivergedError as error:
             raise ConfigError(

@@ -46,12 +46,13 @@ def clock(sleep):
 
 
 @pytest.mark.parametrize("words", [WORDS, SAC_WORDS], ids=["DFlow", "SFlow"])
-def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path, words):
+def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path, capsys, words):
     """In random play, in the training of the flow, in warm-up, between gradient steps, in evaluations."""
     whole = Breaks()
     train(tmp_path / "whole", words, whole)
     check = Breaks(*range(5, whole.calls, whole.calls // 9))
     assert train_through(tmp_path / "broken", words, check) >= 8
+    assert "interrupted in the training of" in capsys.readouterr().err
     assert_identical(outcome(tmp_path / "whole"), outcome(tmp_path / "broken"))
     one, other = (flow_folders(tmp_path / root)[0] for root in ("whole", "broken"))
     assert one.name == other.name and {path.name for path in other.iterdir()} == {path.name for path in one.iterdir()}

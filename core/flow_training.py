@@ -5,7 +5,8 @@ With x the point of the box, a the action and s the state:
 - `mle`, as FlowPG: actions a are uniform in the set, x = encode(a | s), and the loss is log |det da/dx| plus half the
   square of x's distance from the box in units of `mle_softness`: maximum likelihood under a box with soft edges.
 - `reverse`, as CV-Flow: points x are uniform in the box, a = decode(x | s), and the loss is -log |det da/dx| plus the
-  violation of a in units of `reverse_softness`: the Kullback-Leibler divergence to a set with soft edges.
+  violation of a in units of `reverse_softness`: the Kullback-Leibler divergence to a set with soft edges. Every other
+  point is moved to the box's faces, where policies often are. Without that, most of the faces end up outside.
 
 States are those of random play, moved towards their mean or away from it (`FURTHEST`).
 """
@@ -128,6 +129,7 @@ class FlowTraining:
     def _divergence(self, rows: Tensor) -> Tensor:
         """The loss `reverse` (batch,) at rows of the pool."""
         x = 2.0 * torch.rand(len(rows), self.constraint.dim, generator=self.generator) - 1.0
+        x[::2] = on_faces(x[::2])
         action, log_det = self.network.decode(self.features[rows], x)
         outside = self.constraint.penalty(self.obs[rows], action) + (action.abs() - 1.0).clamp(min=0.0).sum(-1)
         return outside / self.flow.reverse_softness - log_det
@@ -136,16 +138,20 @@ class FlowTraining:
     def measure(self) -> dict[str, float]:
         """How good the flow is at other states of the same kind, with the same random numbers each time.
 
-        `accuracy` is the share of uniform points of the box that it decodes to feasible actions, `recall` that of
-        uniform feasible actions that it encodes into the box, and `violation` the mean violation of decoded actions,
-        where a feasible one counts as 0.
+        `accuracy` is the share of uniform points of the box that it decodes to feasible actions, `face_accuracy` that
+        of points of the box's faces, `recall` that of uniform feasible actions that it encodes into the box, and
+        `violation` the mean violation of decoded actions, where a feasible one counts as 0.
         """
         features = self.constraint.features(self.test_obs)
         x = 2.0 * torch.rand(self.test_actions.shape, generator=torch.Generator().manual_seed(2)) - 1.0
-        violation = self.constraint.violation(self.test_obs, self.network.decode(features, x)[0])
+        violation, on_face = (
+            self.constraint.violation(self.test_obs, self.network.decode(features, each)[0])
+            for each in (x, on_faces(x))
+        )
         encoded = self.network.encode(features, self.test_actions)[0]
         return {
             "accuracy": (violation <= _FEASIBLE).double().mean().item(),
+            "face_accuracy": (on_face <= _FEASIBLE).double().mean().item(),
             "recall": (encoded.abs().amax(-1) <= 1.0).double().mean().item(),
             "violation": violation.double().clamp(min=0.0).mean().item(),
         }
@@ -170,3 +176,8 @@ class FlowTraining:
             self.optimizer.state[self.parameters[int(number)]][key].copy_(value)
         self.generator.set_state(state["generator"])
         self.step = state["step"]
+
+
+def on_faces(x: Tensor) -> Tensor:
+    """The points (..., d) of the box's faces that are on the rays from the origin through x."""
+    return x / x.abs().amax(-1, keepdim=True)

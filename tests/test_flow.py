@@ -225,6 +225,7 @@ def test_a_short_training_takes_nearly_all_of_the_box_into_the_set(how, constrai
         training.advance()
     after = training.measure()
     assert after["accuracy"] > max(0.95, before["accuracy"]) and after["recall"] > 0.75
+    assert after["face_accuracy"] > 0.8
     assert after["violation"] < before["violation"]
 
 

@@ -94,10 +94,10 @@ def test_what_a_training_leaves(tmp_path):
     train(tmp_path, WORDS)
     (folder,) = flow_folders(tmp_path)
     header, *rows = (folder / "training.csv").read_text().splitlines()
-    assert header == "step,seconds,accuracy,recall,violation"
+    assert header == "step,seconds,accuracy,face_accuracy,recall,violation"
     rows = np.array([[float(x) for x in row.split(",")] for row in rows])
     assert rows[:, 0].tolist() == list(range(1, 21)) and (np.diff(rows[:, 1]) >= 0).all()
-    assert ((rows[:, 2:4] > 0) & (rows[:, 2:4] <= 1)).all()
+    assert ((rows[:, 2:5] > 0) & (rows[:, 2:5] <= 1)).all()
     settings = json.loads((folder / "settings.json").read_text())
     assert settings["flow"]["flow"] == "reverse" and settings["flow"]["flow_steps"] == 20
     for run in find_runs(tmp_path):

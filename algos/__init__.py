@@ -19,6 +19,7 @@ from algos.td3 import TD3
 from constraints import Constraint
 from core.agent import Agent
 from core.config import Config, PenaltyConfig, keys_of, restore_settings
+from core.flow import Flow
 from core.maps import Alpha, Gauge, Map, Placement, Project, Radial
 from core.words import ConfigError, NameTable, known_name
 from store.files import one_line
@@ -100,6 +101,8 @@ PAPER = tuple(ALGORITHMS)
 ALGORITHMS |= {
     "DGauge": Algorithm(TD3, Gauge(), "layer"),
     "SGauge": Algorithm(SAC, Gauge(), "layer"),
+    "DFlow": Algorithm(TD3, Flow(), "layer"),
+    "SFlow": Algorithm(SAC, Flow(), "layer"),
     "ARAM": Algorithm(ARAM, Project(), "environment"),
 }
 

@@ -98,7 +98,9 @@ class _Check:
         raise ContractError(f"{self.name}: {message}")
 
     def _build(self, seeds: Sequence[int]) -> Agent:
-        return self.algorithm.build(self.config, CONSTRAINT, OBS, list(seeds))
+        agent = self.algorithm.build(self.config, CONSTRAINT, OBS, list(seeds))
+        agent.map.use_untrained(CONSTRAINT, torch.zeros(1, OBS))
+        return agent
 
     @contextmanager
     def _own_randomness(self, when: str) -> Iterator[None]:

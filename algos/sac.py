@@ -1,4 +1,4 @@
-"""SAC under action constraints: SPre, SPre+, SAlpha, SRad and SGauge.
+"""SAC under action constraints: SPre, SPre+, SAlpha, SRad, SGauge and SFlow.
 
 Haarnoja et al. (2018) with a learned temperature and a feasibility map (paper, Section "Incorporating Action
 Constraints to SAC"). The actor's Gaussian is squashed by tanh where the map says so, and the critic sees the result

@@ -1,4 +1,4 @@
-"""TD3 under action constraints: DPro, DPre, DOpt, DAlpha, DRad, DGauge and their + variants.
+"""TD3 under action constraints: DPro, DPre, DOpt, DAlpha, DRad, DGauge, DFlow and their + variants.
 
 Fujimoto et al. (2018) with a feasibility map P_s between the actor mu and the critics (paper, Sections "Algorithms
 Based on the Closest Point Projection" and "Other Mapping Techniques"). The names differ only in which map, where it

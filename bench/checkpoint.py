@@ -52,6 +52,7 @@ def measure(config: Config, count: int, folder: Path) -> None:
     folders = [folder / f"seed={seed}" for seed in seeds]
     writers = [RunWriter(path, saved_settings(config, seed), {}, 1) for path, seed in zip(folders, seeds, strict=True)]
     trainer = make_trainer(config, seeds, writers, progress=False)
+    trainer.agent.map.use_untrained(trainer.agent.constraint, trainer.obs)
     trainer._begin()
     trainer.replay.rows.uniform_()
     transitions = trainer.replay.capacity

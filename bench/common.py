@@ -39,8 +39,10 @@ def make_agent(name: str, batch: int, seeds: Sequence[int], device: torch.device
 
 def agent_of(config: Config, seeds: Sequence[int]) -> Agent:
     """A new agent with these settings."""
-    obs_dim = envs.TASKS[config.env].robot.obs_dim
-    return ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, seeds)
+    obs_dim, constraint = envs.TASKS[config.env].robot.obs_dim, envs.constraint(config.env)
+    agent = ALGORITHMS[config.algo].build(config, constraint, obs_dim, seeds)
+    agent.map.use_untrained(constraint, torch.zeros(1, obs_dim))
+    return agent
 
 
 def fill_replay(agent: Agent, transitions: int) -> Replay:

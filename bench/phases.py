@@ -80,13 +80,18 @@ class Stopwatch:
 def new_trainer(
     config: Config, seeds: Sequence[int], stop_if_asked: Callable[[], None] = lambda: None
 ) -> Iterator[Trainer]:
-    """A trainer as run.py makes it, without a progress bar, whose folders are deleted afterwards."""
+    """A trainer as run.py makes it, without a progress bar, whose folders are deleted afterwards.
+
+    A map that learns before the training has learned nothing: speed does not depend on it.
+    """
     with tempfile.TemporaryDirectory() as folder:
         writers = [
             RunWriter(Path(folder) / str(seed), saved_settings(config, seed), {}, config.eval_episodes)
             for seed in seeds
         ]
-        yield make_trainer(config, seeds, writers, False, stop_if_asked)
+        trainer = make_trainer(config, seeds, writers, False, stop_if_asked)
+        trainer.agent.map.use_untrained(trainer.agent.constraint, trainer.obs)
+        yield trainer
 
 
 def measure_phases(algo: str, seeds: Sequence[int]) -> Phases:

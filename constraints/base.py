@@ -166,6 +166,18 @@ class Constraint(ABC):
         obs64, action64 = self._broadcast(obs, action)
         return self._penalty(self._at(obs64), action64).to(action.dtype)
 
+    def features(self, obs: Tensor) -> Tensor:
+        """The numbers (..., k), float64, that the set at obs (..., n) depends on: its coefficients without constants.
+
+        For a set that reads the observation in each method, they are the observation.
+        """
+        check_observation(obs)
+        # With three more dimensions than the observations have, a coefficient cannot be a constant, which has two.
+        obs64, lead = obs.double(), obs.shape[:-1]
+        values = [value for value in tensors_of(self._at(obs64[None, None, None])) if value.dim() >= 3 + len(lead)]
+        rows = [value.reshape(*lead, value.shape[3 + len(lead) :].numel()) for value in values]
+        return torch.cat([obs64[..., :0], *rows], -1)
+
     def project(self, obs: Tensor, action: Tensor) -> Tensor:
         """Closest feasible point (..., d) in the Euclidean norm, with its exact Jacobian in `action`."""
         obs64, action64 = self._broadcast(obs, action)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
 from typing import Any, ClassVar, NamedTuple, get_args
 
 import torch
@@ -17,6 +16,9 @@ from core.maps import Map, Placement
 from core.random import Streams
 from core.replay import Batch
 from core.snapshot import Snapshots, parameters_of
+
+MAP = "map"
+"""In the names of saved parameters, the map."""
 
 
 class Action(NamedTuple):
@@ -111,8 +113,7 @@ class Agent(Snapshots):
     ):
         self.config, self.constraint = config, constraint
         self.seeds, self.obs_dim, self.action_dim = seeds, obs_dim, constraint.dim
-        options = {f.name: getattr(config, f.name) for f in fields(map) if hasattr(config, f.name)}
-        self.map = replace(map, **options) if options else map
+        self.map = map.configured(config)
         self.placement = placement
         self.stores_centers = self.map.replays_center(constraint)
         self.penalty_weight = config.penalty if isinstance(config, PenaltyConfig) else None
@@ -219,6 +220,10 @@ class Agent(Snapshots):
         """What the map is given of the suggestions `raw`: the box's closest point where the map squashes."""
         return raw.clamp(-1.0, 1.0) if self.map.squashes else raw
 
+    def proposed(self, obs: Tensor, raw: Tensor) -> Tensor:
+        """The actions of which training.csv tells how far outside the set they are, for the suggestions `raw`."""
+        return self.map.propose(self.constraint, obs, self.bounded(raw))
+
     def warm_up(self, which: Sequence[int]) -> Tensor:
         """Random suggestions (seeds, d), uniform in the box, for the seeds `which`."""
         return self.exploration.uniform(self.action_dim, which=which)
@@ -265,6 +270,14 @@ class Agent(Snapshots):
                 for i in (~finite).nonzero().flatten().tolist():
                     found.setdefault(i, f"{name} loss")
         return found
+
+    def state(self, i: int) -> dict[str, Tensor]:
+        return super().state(i) | {f"{MAP}.{name}": value for name, value in self.map.state().items()}
+
+    def load_state(self, i: int, state: dict[str, Tensor]) -> None:
+        super().load_state(i, state)
+        learned = {name.removeprefix(f"{MAP}."): value for name, value in state.items() if name.startswith(f"{MAP}.")}
+        self.map.load_state(learned)
 
     def streams(self) -> dict[str, Streams]:
         return {"exploration": self.exploration, "update_noise": self.update_noise}

@@ -7,13 +7,14 @@ made with `core.config.setting`, are keys of the command line for the algorithms
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Literal, NamedTuple
 
 from torch import Tensor
 
 from constraints import Constraint
-from core.config import NOT_NEGATIVE, POSITIVE, one_of, setting
+from core.config import NOT_NEGATIVE, POSITIVE, Config, one_of, setting
 
 Placement = Literal["environment", "rollout", "layer"]
 """Where a map stands between the actor and the robot: see `core.agent.Agent`."""
@@ -66,6 +67,25 @@ class Map(ABC):
     def limit_target(self, constraint: Constraint, obs: Tensor, action: Tensor, center: Tensor | None) -> Tensor:
         """Put a target action (..., d), to which TD3 has added noise, back where the critic knows actions."""
         return self.pull_back(constraint, obs, action, center)
+
+    def configured(self, config: Config) -> Map:
+        """The map with the settings that `config` has of its fields."""
+        options = {f.name: getattr(config, f.name) for f in fields(self) if hasattr(config, f.name)}
+        return replace(self, **options) if options else self
+
+    def propose(self, constraint: Constraint, obs: Tensor, suggested: Tensor) -> Tensor:
+        """The action (..., d) before it is made feasible, whose violation training.csv has: the suggestion itself."""
+        return suggested
+
+    def use_untrained(self, constraint: Constraint, obs: Tensor) -> None:  # noqa: B027 - most maps learn nothing
+        """Do without what the map learns before a training, if it does: for checks, and to measure speed."""
+
+    def state(self) -> dict[str, Tensor]:
+        """What the map has learned before a training, on the CPU. Saved parameters have it too."""
+        return {}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:  # noqa: B027 - most maps learn nothing
+        """Take what `state` has returned."""
 
     def replays_center(self, constraint: Constraint) -> bool:
         """Whether the replay buffer has two centres a transition. The origin needs no storing."""

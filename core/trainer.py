@@ -197,9 +197,10 @@ class Trainer:
             exploring = [seed.position for seed in seeds if seed.steps >= starts]
             action = self.agent.act(self.obs, self.center, warming_up, exploring)
             if measured := [seed for seed in seeds if seed.position in exploring and seed.is_measured]:
-                violations = self.agent.constraint.violation(self.obs, self.agent.bounded(action.suggested)).tolist()
+                proposed = self.agent.proposed(self.obs, action.suggested)
+                violations = self.agent.constraint.violation(self.obs, proposed)
                 for seed in measured:
-                    seed.suggestions.add(violations[seed.position])
+                    seed.suggestions.add(violations[seed.position].item())
             self._fail_refused()
         arrived, reset_obs = self.obs.numpy().copy(), {}
         reward, terminated, ended = (np.zeros((len(self.seeds), 1), dtype=np.float32) for _ in range(3))
@@ -216,7 +217,6 @@ class Trainer:
                     reset_obs[i] = seed.env.reset()[0]
         if not stepped:
             return
-
         next_obs = _tensor(arrived)
         with self.timer.timed("acting"):
             next_center = self.agent.centers(next_obs)

@@ -25,7 +25,7 @@ COLORS = {
     "SRad": "#222222",
 }
 FAMILIES = {"TD3 family": list(COLORS)[:9], "SAC family": list(COLORS)[9:]}
-LATER = {"DGauge": "#b5a100", "SGauge": "#ff6f61", "ARAM": "#7f00ff"}
+LATER = {"DGauge": "#b5a100", "SGauge": "#ff6f61", "DFlow": "#4b6cb7", "SFlow": "#2e8b57", "ARAM": "#7f00ff"}
 """The colours of the methods here that are not the paper's. Tables and figures have them apart, after the paper's."""
 BEYOND = "beyond the paper"
 """The heading above these methods and those of one's own."""

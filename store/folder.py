@@ -14,7 +14,7 @@
         checkpoint/      while the run is unfinished: see store/checkpoint.py (tensorboard/, wandb/: store/loggers.py)
     results/<task>/<variant>/seed=<n>.lock
                          while a process trains the run: its process id, host and Slurm job; see store/lock.py
-    results/sweep/       logs and records of sweeps: see sweep/cells.py
+    results/sweep/       logs and records of sweeps: see sweep/cells.py (results/flows/: see sweep/flows.py)
 
 `<variant>` is the algorithm's name followed by `,key=value` for each setting that differs from the paper's
 (`DPre+`, `SRad,learning_starts=10000,steps=50000`). Where that is longer than a file system allows, the folder is

@@ -105,6 +105,8 @@ def _check_algorithm(config: Config, constraint: Constraint, obs: Tensor) -> Non
     alone, agent = (
         algorithm.build(small, constraint, obs.shape[-1], seeds) for seeds in ([SEEDS - 1], list(range(SEEDS)))
     )
+    for each in (alone, agent):
+        each.map.use_untrained(constraint, obs)
     try:
         check_parameters(config.algo, alone, agent)
     except ContractError as error:

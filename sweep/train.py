@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 import envs
 from algos import ALGORITHMS, setting_keys
@@ -30,6 +31,7 @@ from sweep.cells import Cell, make_cells
 from sweep.check import check_training
 from sweep.definition import changed_runs, define, refuse
 from sweep.exit import Exit, stoppable
+from sweep.flows import flow_of
 from sweep.plugins import load_plugins, refuse_to_train_in_plugin
 
 
@@ -101,6 +103,9 @@ def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Call
                 _resume(cell, folders, group, ended, info, definition, stop_if_asked)
         if fresh:
             info["lockstep"] = fresh
+            flow = flow_of(config, definition, stop_if_asked)
+            if flow is not None:
+                info["flow"] = flow["measures"]
             writers = [
                 RunWriter(
                     folders[seed],
@@ -112,7 +117,7 @@ def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Call
                 )
                 for seed in fresh
             ]
-            _run(make_trainer(config, fresh, writers, True, stop_if_asked))
+            _run(make_trainer(config, fresh, writers, True, stop_if_asked, flow and flow["state"]))
         return not any(has_failed(folder) for folder in folders.values())
 
 
@@ -122,9 +127,11 @@ def make_trainer(
     writers: Sequence[RunWriter],
     progress: bool = True,
     stop_if_asked: Callable[[], None] = lambda: None,
+    flow: Mapping[str, Tensor] | None = None,
 ) -> Trainer:
     """The trainer of one cell, with its environments and its agent; one writer for each seed.
 
+    `flow` has the parameters of the map's flow, where it has one and the training does not resume.
     Raises ConfigError if the networks and the replay buffer do not fit into memory.
     """
     new_env = partial(make_env, config.env, config.simulator)
@@ -132,6 +139,8 @@ def make_trainer(
     obs_dim = train_envs[0].observation_space.shape[0]
     try:
         agent = ALGORITHMS[config.algo].build(config, envs.constraint(config.env), obs_dim, list(seeds))
+        if flow:
+            agent.map.load_state(flow)
         return Trainer(config, agent, train_envs, new_env, envs.step_together, writers, progress, stop_if_asked)
     except RuntimeError as error:
         if not any(words in str(error) for words in ("allocate memory", "out of memory")):

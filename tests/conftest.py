@@ -10,6 +10,10 @@ import torch
 from helpers import CHECKPOINTED, outcome, train
 from hypothesis import settings
 
+from algos import ALGORITHMS, Algorithm
+from core import flow_training
+from sweep import flows
+
 settings.register_profile("ci", max_examples=40, deadline=None)
 settings.register_profile("long", max_examples=1000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
@@ -30,3 +34,14 @@ def unbroken(tmp_path_factory):
     root = tmp_path_factory.mktemp("unbroken")
     train(root, CHECKPOINTED)
     return outcome(root)
+
+
+@pytest.fixture
+def small_flows(monkeypatch):
+    """Flows see few states, and train for 20 steps where a command does not say how many."""
+    monkeypatch.setattr(flows, "STATES", 400)
+    monkeypatch.setattr(flow_training, "HELD_OUT", 100)
+    monkeypatch.setattr(flow_training, "POOL", 500)
+    for algorithm in (ALGORITHMS["DFlow"], ALGORITHMS["SFlow"]):
+        monkeypatch.setitem(vars(algorithm.map), "flow_steps", 20)
+        monkeypatch.setitem(vars(algorithm), "config_class", Algorithm.config_class.func(algorithm))  # it is cached

@@ -34,6 +34,12 @@ def make_agent(name, gsde=False, constraint=CONSTRAINT, seeds=SEEDS, **settings)
     if name == "NFW":
         settings = {"fw_learning_rate": 0.3} | settings
     agent = algorithm.build(replace(paper, **settings), constraint, OBS, list(seeds))
+    agent.map.use_untrained(constraint, torch.zeros(1, OBS))
+    state = agent.map.state()
+    noise = torch.Generator().manual_seed(6)
+    agent.map.load_state(
+        {key: value + 0.3 * (torch.rand(value.shape, generator=noise) - 0.5) for key, value in state.items()}
+    )
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         for parameter in [p for module in agent.networks().values() for p in module.parameters()]:
@@ -58,7 +64,7 @@ def make_batch(seed=0):
 # ---------------------------------------------------------------- the formulas, for one seed: obs (batch, n)
 
 
-MAPS = {"Alpha": "alpha_map", "Rad": "radial_map", "Gauge": "gauge_map"}
+MAPS = {"Alpha": "alpha_map", "Rad": "radial_map", "Gauge": "gauge_map", "Flow": "flow"}
 
 
 def map_of(agent):
@@ -67,10 +73,17 @@ def map_of(agent):
 
 
 def squashes(agent):
-    return map_of(agent) in ("project", "gauge_map")
+    return map_of(agent) in ("project", "gauge_map", "flow")
+
+
+def projects(agent):
+    """Whether the map pulls random actions back by projection, and thus needs no centre."""
+    return map_of(agent) in ("project", "flow")
 
 
 def mapped(agent, obs, suggested, center=None):
+    if map_of(agent) == "flow":
+        return CONSTRAINT.project(obs, decoded(agent, obs, suggested)[0])
     arguments = (obs, suggested) if map_of(agent) == "project" else (obs, suggested, center)
     return getattr(CONSTRAINT, map_of(agent))(*arguments)
 
@@ -86,6 +99,24 @@ def q_values(critic, i, obs, action):
     """(2, batch): both critics of the seed in position i."""
     x = torch.cat([obs, action], -1)
     return torch.stack([mlp(critic.net, j * len(SEEDS) + i, x).squeeze(-1) for j in range(2)])
+
+
+def decoded(agent, obs, suggested):
+    """What the flow makes of a suggestion, coupling by coupling, and the logarithm of its Jacobian's determinant."""
+    state = agent.map.state()
+    features = 2.0 * obs[..., :DIM] + 3.0
+    features = ((features - state["feature_mean"]) / state["feature_scale"]).clamp(-5, 5)
+    x, log_det = list(suggested.unbind(-1)), state["action_scale"].log().sum()
+    for k in range(6):
+        h = torch.cat((x[k % 2].unsqueeze(-1), features), -1)
+        for number in range(3):
+            name = f"couplings.{k}.layers.{number}"
+            h = (torch.where(h > 0, h, 0.01 * h) if number else h) @ state[f"{name}.weight"][0] + state[f"{name}.bias"][
+                0
+            ]
+        x[1 - k % 2] = x[1 - k % 2] * h[..., 0].tanh().exp() + h[..., 1]
+        log_det = log_det + h[..., 0].tanh()
+    return state["action_mean"] + state["action_scale"] * torch.stack(x, -1), log_det
 
 
 def deterministic(agent, actor, i, obs, center):
@@ -117,6 +148,8 @@ def sampled(agent, actor, i, obs, center, noise):
         u = raw.tanh()
         ratio = u.abs().amax(-1) / CONSTRAINT.gauge(obs, u, center)
         return u, CONSTRAINT.gauge_map(obs, u, center), after_tanh - DIM * ratio.log()
+    if map_of(agent) == "flow":
+        return raw.tanh(), mapped(agent, obs, raw.tanh()), after_tanh - decoded(agent, obs, raw.tanh())[1]
     if map_of(agent) == "alpha_map":
         return (
             raw,
@@ -145,7 +178,7 @@ def expected_actor_loss(name, agent, actor, temperature, batch, noise):
             loss = ((suggested - reference) ** 2).sum(-1)
         else:
             suggested, executed = deterministic(agent, actor, i, obs, center)
-            seen = executed if name in ("DOpt", "DOpt+", "DAlpha", "DRad", "DGauge") else suggested
+            seen = executed if name in ("DOpt", "DOpt+", "DAlpha", "DRad", "DGauge", "DFlow") else suggested
             loss = -q_values(agent.critic, i, obs, seen)[0]
         if name.endswith("+"):
             loss = loss + 1.5 * CONSTRAINT.penalty(obs, suggested)
@@ -165,8 +198,10 @@ def expected_targets(name, agent, before, temperature, batch, noise):
         else:
             suggested, executed = deterministic(agent, before["actor_target"], i, obs, center)
             action = (suggested if name in ("DPre", "DPre+") else executed) + noise[i].clamp(-0.6, 0.6)
-            pulled_back = CONSTRAINT.alpha_map(obs, action, center)
-            action = pulled_back if name in ("DAlpha", "DRad", "DGauge") else action.clamp(-1, 1)
+            pull_back = (
+                CONSTRAINT.project(obs, action) if projects(agent) else CONSTRAINT.alpha_map(obs, action, center)
+            )
+            action = pull_back if name in ("DAlpha", "DRad", "DGauge", "DFlow") else action.clamp(-1, 1)
             value = 0.0
         value = value + q_values(before["critic_target"], i, obs, action).amin(0)
         rows.append(batch.reward[i] + 0.9 * (1 - batch.terminated[i]) * value)
@@ -488,7 +523,7 @@ def test_acting_maps_explored_suggestions_and_pulls_random_ones_back(name):
     agent, obs = make_agent(name, **({"action_noise": 2.0} if name in TD3_NAMES else {})), make_batch().obs[:, 0]
     twin = make_agent(name, **({"action_noise": 2.0} if name in TD3_NAMES else {}))
     center = agent.centers(obs)
-    assert (center is None) == (map_of(agent) == "project")
+    assert (center is None) == projects(agent)
     for warming_up, exploring in (([0], [1]), ([1], [0]), ([0, 1], []), ([], [0, 1])):
         found = agent.act(obs, center, warming_up, exploring)
         suggested = torch.zeros(len(SEEDS), DIM)
@@ -498,7 +533,7 @@ def test_acting_maps_explored_suggestions_and_pulls_random_ones_back(name):
             suggested[exploring] = twin.explore(obs, exploring)[exploring]
         in_box = suggested.clamp(-1, 1) if squashes(agent) else suggested
         executed = mapped(agent, obs, in_box, center)
-        pulled_back = CONSTRAINT.project if map_of(agent) == "project" else CONSTRAINT.alpha_map
+        pulled_back = CONSTRAINT.project if projects(agent) else CONSTRAINT.alpha_map
         executed[warming_up] = pulled_back(obs, suggested)[warming_up]
         torch.testing.assert_close(found.executed, executed)
         assert torch.equal(found.stored, in_box if agent.placement == "environment" else found.executed)
@@ -513,8 +548,11 @@ def test_executed_and_warm_up_actions_are_feasible(name):
     agent, obs = make_agent(name), make_batch().obs
     suggested = 3 * torch.randn(obs.shape[:-1] + (DIM,), generator=torch.Generator().manual_seed(1))
     suggested = suggested.tanh() if squashes(agent) else suggested
-    assert torch.equal(agent.feasible(obs, suggested, None), mapped(agent, obs, suggested))
-    pulled = (CONSTRAINT.project if map_of(agent) == "project" else CONSTRAINT.alpha_map)(obs, suggested)
+    rounding = 1e-5 if map_of(agent) == "flow" else 0.0  # of `decoded`, which takes other steps
+    torch.testing.assert_close(
+        agent.feasible(obs, suggested, None), mapped(agent, obs, suggested), rtol=rounding, atol=rounding
+    )
+    pulled = (CONSTRAINT.project if projects(agent) else CONSTRAINT.alpha_map)(obs, suggested)
     assert torch.equal(agent.map.pull_back(CONSTRAINT, obs, suggested, None), pulled)
     torch.testing.assert_close(agent.map.pull_back(CONSTRAINT, obs, pulled, None), pulled)
     warm = torch.stack([agent.warm_up([0, 1]) for _ in range(200)])

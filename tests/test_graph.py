@@ -35,6 +35,7 @@ def make(name, task="W+M", device="cpu"):
     config = config_of([f"algo={name}", f"env={task}", "hidden=[16,16]", f"batch_size={BATCH}"])
     constraint, robot = envs.constraint(task), envs.TASKS[task].robot
     agent = ALGORITHMS[name].build(replace(config, device=device), constraint, robot.obs_dim, SEEDS)
+    agent.map.use_untrained(constraint, torch.zeros(1, robot.obs_dim))
     replay = Replay(SEEDS, 60, agent.obs_dim, agent.action_dim, agent.stores_centers, agent.device)
     generator = torch.Generator().manual_seed(0)
 

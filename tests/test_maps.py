@@ -15,6 +15,7 @@ from algos.td3 import TD3
 from constraints import WeightedPositivePart
 from core.agent import Agent
 from core.config import NOT_NEGATIVE, Config, keys_of, resolve, saved_settings, setting
+from core.flow import Flow
 from core.maps import Alpha, Gauge, Map, Project, Radial, Sample
 from core.networks import MLP, Adam, frozen_copy, rows_of, soft_update
 from core.replay import Batch, Replay
@@ -24,7 +25,7 @@ from plots.definitions import hyperparameter_table
 
 DIM, OBS = 2, 3
 CONSTRAINT = WeightedPositivePart(lambda obs: 2.0 * obs[..., :DIM] + 3.0, 0.8, DIM)  # its centre is not the origin
-ALL_MAPS = (Project(), Alpha(), Radial(), Gauge())
+ALL_MAPS = (Project(), Alpha(), Radial(), Gauge(), Flow())
 
 
 class Soft(Map):

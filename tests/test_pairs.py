@@ -26,6 +26,7 @@ def settings(algo, task):
     ]
 
 
+@pytest.mark.usefixtures("small_flows")
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_pair(tmp_path, capsys, monkeypatch, algo, task):
@@ -50,7 +51,7 @@ def test_pair(tmp_path, capsys, monkeypatch, algo, task):
     last = torch.load(folder / "last.pt", weights_only=True)
     assert all(parameter.isfinite().all() for parameter in last.values())
     assert last.keys() == fresh.keys()
-    modules = {name.split(".")[0] for name in last}
+    modules = {name.split(".")[0] for name in last} - {"map"}  # which nothing trains any more
     assert {"actor", "critic", "critic_target"} <= modules and ("actor_target" in modules) == (
         ALGORITHMS[algo].agent.family == "TD3"
     )

@@ -327,6 +327,7 @@ def test_the_buffer_has_suggestions_where_the_environment_maps_and_executed_acti
     if name == "ARAM":
         config.most_rejections = 1  # so that it projects what it rejects
     agent = algorithm.build(config, CONSTRAINT, OBS, [4])
+    agent.map.use_untrained(CONSTRAINT, torch.zeros(1, OBS))
     trainer = make_trainer(tmp_path, agent=agent)
     trainer.run()
     obs, stored, *_ = transitions(trainer)

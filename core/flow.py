@@ -1,0 +1,210 @@
+"""The map of DFlow and SFlow: a conditional normalising flow takes the box to the feasible set of each state.
+
+The flow is RealNVP (Dinh et al., 2017) with six affine couplings, as in FlowPG (Brahmanage et al., NeurIPS 2023) and
+CV-Flow (the same, AAAI 2025). `core.flow_training` trains it before the agent, once for all seeds. It is not exact:
+what it makes of a point of the box may lie outside the set, and the map projects that.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import leaky_relu
+
+from constraints import Constraint
+from core.config import AT_LEAST_ONE, POSITIVE, one_of, setting
+from core.maps import Map, Sample
+from core.networks import Linear
+
+COUPLINGS = 6
+CPU = torch.device("cpu")
+_LARGEST_FEATURE = 5.0
+"""Standard deviations from the mean at which a feature is cut: the training has seen nothing further out."""
+
+
+class Coupling(nn.Module):
+    """The affine map x -> exp(s) x + t of some coordinates; s and t depend on the other coordinates and the features.
+
+    s is in [-1, 1]. A new one is the identity.
+    """
+
+    def __init__(self, given: int, moved: int, features: int, width: int, generator: torch.Generator):
+        super().__init__()
+        sizes = [given + features, width, width, 2 * moved]
+        self.layers = nn.ModuleList(Linear(n, m, [generator]) for n, m in zip(sizes, sizes[1:], strict=False))
+        for parameter in self.layers[-1].parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, given: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        """s and t (batch, moved) at the other coordinates (batch, given) and the features (batch, k)."""
+        x, last = torch.cat((given, features), -1), len(self.layers) - 1
+        for number, layer in enumerate(cast("Iterable[Linear]", self.layers)):
+            x = torch.addmm(layer.bias[0], x, layer.weight[0])
+            if number < last:
+                x = leaky_relu(x)
+        scale, shift = x.chunk(2, -1)
+        return scale.tanh(), shift
+
+
+class ConditionalFlow(nn.Module):
+    """A bijection of R^d for each state: `decode` takes points x (..., d) to actions a (..., d), `encode` back.
+
+    Both take the features (..., k) of the states first, whose leading dimensions broadcast, and also return
+    log |det da/dx| (...). Results have the dtype of the parameters.
+    """
+
+    feature_mean: Tensor
+    feature_scale: Tensor
+    action_mean: Tensor
+    action_scale: Tensor
+
+    def __init__(self, dim: int, features: int, width: int, generator: torch.Generator):
+        super().__init__()
+        self.middle = dim // 2
+        self.shifts = [number // 2 if dim > 2 else 0 for number in range(COUPLINGS)]
+        sizes = (self.middle, dim - self.middle)
+        self.couplings = nn.ModuleList(
+            Coupling(*(sizes if number % 2 == 0 else sizes[::-1]), features, width, generator)
+            for number in range(COUPLINGS)
+        )
+        for name, count in (("feature", features), ("action", dim)):
+            self.register_buffer(f"{name}_mean", torch.zeros(count))
+            self.register_buffer(f"{name}_scale", torch.ones(count))
+
+    def standardize(self, features: Tensor, actions: Tensor) -> None:
+        """Take means and scales from features (n, k) and feasible actions (m, d)."""
+        self.feature_mean.copy_(features.mean(0))
+        deviation = (features - self.feature_mean).square().mean(0).sqrt()
+        self.feature_scale.copy_(torch.where(deviation > 1e-6, deviation, 1.0))
+        self.action_mean.copy_(actions.mean(0))
+        self.action_scale.copy_(actions.std(0) * 3.0**0.5)  # the box itself has the deviation 1 / sqrt(3)
+
+    def decode(self, features: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        lead, x, features = self._prepare(features, x)
+        log_det = self.action_scale.log().sum()
+        for number, coupling in enumerate(self.couplings):
+            given, moved = self._split(number, x)
+            scale, shift = coupling(given, features)
+            x = self._join(number, given, moved * scale.exp() + shift)
+            log_det = log_det + scale.sum(-1)
+        return (self.action_mean + self.action_scale * x).view(*lead, -1), log_det.view(lead)
+
+    def encode(self, features: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        lead, action, features = self._prepare(features, action)
+        x, log_det = (action - self.action_mean) / self.action_scale, self.action_scale.log().sum()
+        for number in reversed(range(COUPLINGS)):
+            given, moved = self._split(number, x)
+            scale, shift = self.couplings[number](given, features)
+            x = self._join(number, given, (moved - shift) * (-scale).exp())
+            log_det = log_det + scale.sum(-1)
+        return x.view(*lead, -1), log_det.view(lead)
+
+    def _prepare(self, features: Tensor, x: Tensor) -> tuple[torch.Size, Tensor, Tensor]:
+        """The common leading shape, the points (batch, d) and the standardised features (batch, k)."""
+        lead = torch.broadcast_shapes(features.shape[:-1], x.shape[:-1])
+        x, features = x.to(self.action_mean.dtype), features.to(self.action_mean.dtype)
+        standard = (features - self.feature_mean) / self.feature_scale
+        standard = standard.clamp(-_LARGEST_FEATURE, _LARGEST_FEATURE)
+        x, standard = (rows.expand(*lead, rows.shape[-1]) for rows in (x, standard))
+        return lead, x.reshape(lead.numel(), x.shape[-1]), standard.reshape(lead.numel(), standard.shape[-1])
+
+    def _split(self, number: int, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The coordinates that a coupling is given, and those that it moves.
+
+        Two halves take turns. Which coordinates are neighbours in a half changes after each two couplings.
+        """
+        x = x.roll(-self.shifts[number], -1)
+        first, second = x[:, : self.middle], x[:, self.middle :]
+        return (first, second) if number % 2 == 0 else (second, first)
+
+    def _join(self, number: int, given: Tensor, moved: Tensor) -> Tensor:
+        """The coordinates (batch, d) in their order."""
+        return torch.cat((given, moved) if number % 2 == 0 else (moved, given), -1).roll(self.shifts[number], -1)
+
+
+@dataclass
+class Flow(Map):
+    """A trained flow, and the projection of what it leaves outside the set.
+
+    The suggestion is a point of the box, which the flow decodes. The log-density is that of the decoded action, before
+    the projection. `load_state` gives it a flow that `core.flow_training` has trained; RuntimeError before that.
+    """
+
+    flow: str = setting(
+        "reverse",
+        "DFlow, SFlow: how the flow is trained, mle (as FlowPG) or reverse (as CV-Flow)",
+        one_of("mle", "reverse"),
+    )
+    flow_width: int = setting(64, "DFlow, SFlow: units in a hidden layer of the flow", AT_LEAST_ONE)
+    flow_steps: int = setting(3_000, "DFlow, SFlow: gradient steps of the flow's training", AT_LEAST_ONE)
+    flow_batch_size: int = setting(256, "DFlow, SFlow: samples in such a step", AT_LEAST_ONE)
+    flow_learning_rate: float = setting(1e-3, "DFlow, SFlow: Adam's at the start; a cosine takes it to 0", POSITIVE)
+    mle_softness: float = setting(0.02, "DFlow, SFlow: width of the box's edges, for flow=mle", POSITIVE)
+    reverse_softness: float = setting(1e-4, "DFlow, SFlow: width of the set's edges, for flow=reverse", POSITIVE)
+
+    flow_entropy: str = setting(
+        "action",
+        "SFlow: entropy of the 'action', or of the 'latent' point of the box as in CV-Flow",
+        one_of("action", "latent"),
+        of_density=True,
+    )
+
+    squashes = True
+    needs_center = False
+
+    def __post_init__(self) -> None:
+        self._networks: dict[torch.device, ConditionalFlow] = {}  # the flow on each device that has asked for it
+
+    def __call__(self, constraint: Constraint, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
+        return constraint.project(obs, self.propose(constraint, obs, suggested))
+
+    def with_log_prob(
+        self, constraint: Constraint, obs: Tensor, sample: Sample, center: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        action, log_det = self._decode(constraint, obs, sample.suggested)
+        latent = self.flow_entropy == "latent"
+        return constraint.project(obs, action), sample.log_prob if latent else sample.log_prob - log_det
+
+    def propose(self, constraint: Constraint, obs: Tensor, suggested: Tensor) -> Tensor:
+        return self._decode(constraint, obs, suggested)[0]
+
+    def pull_back(self, constraint: Constraint, obs: Tensor, action: Tensor, center: Tensor | None) -> Tensor:
+        return constraint.project(obs, action)
+
+    def new_network(self, dim: int, features: int) -> ConditionalFlow:
+        """An untrained flow for actions (..., dim) and so many features of the state, always the same."""
+        return ConditionalFlow(dim, features, self.flow_width, torch.Generator().manual_seed(0))
+
+    def use_untrained(self, constraint: Constraint, obs: Tensor) -> None:
+        self._take(self.new_network(constraint.dim, constraint.features(obs).shape[-1]))
+
+    def state(self) -> dict[str, Tensor]:
+        networks = [self._networks[CPU]] if self._networks else []
+        return {name: value.clone() for network in networks for name, value in network.state_dict().items()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        if not self._networks:
+            self._take(self.new_network(len(state["action_mean"]), len(state["feature_mean"])))
+        for network in self._networks.values():
+            network.load_state_dict(state)
+
+    def _decode(self, constraint: Constraint, obs: Tensor, suggested: Tensor) -> tuple[Tensor, Tensor]:
+        """The actions (..., d) that the flow makes of suggestions, and log |det da/dx| (...)."""
+        action, log_det = self._on(obs.device).decode(constraint.features(obs), suggested)
+        return action.to(suggested.dtype), log_det.to(suggested.dtype)
+
+    def _take(self, network: ConditionalFlow) -> None:
+        self._networks = {CPU: network.requires_grad_(False)}
+
+    def _on(self, device: torch.device) -> ConditionalFlow:
+        """The flow on a device."""
+        if not self._networks:
+            raise RuntimeError("this map has no flow yet: sweep.flows trains one, and load_state takes it")
+        if device not in self._networks:
+            self._networks[device] = copy.deepcopy(self._networks[CPU]).to(device)
+        return self._networks[device]

@@ -1,0 +1,183 @@
+"""The training of a flow (`core.flow`), before that of an agent: once for a task and settings, shared by all seeds.
+
+With x the point of the box, a the action and s the state:
+
+- `mle`, as FlowPG: actions a are uniform in the set, x = encode(a | s), and the loss is log |det da/dx| plus half the
+  square of x's distance from the box in units of `mle_softness`: maximum likelihood under a box with soft edges.
+- `reverse`, as CV-Flow: points x are uniform in the box, a = decode(x | s), and the loss is -log |det da/dx| plus the
+  violation of a in units of `reverse_softness`: the Kullback-Leibler divergence to a set with soft edges. Every other
+  point is moved to the box's faces, where policies often are. Without that, most of the faces end up outside.
+
+States are those of random play, moved towards their mean or away from it (`FURTHEST`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from constraints import Constraint, ConstraintError
+from core.flow import Flow
+from core.networks import Adam
+from core.snapshot import parameters_of
+
+POOL = 100_000
+"""States of a training, each with an action that is uniform in its set for `mle`."""
+HELD_OUT = 4_000
+"""The number of states, of parts of random play that the training does not use, for the measures."""
+FURTHEST = 4.0
+"""Times as far from their mean as in random play, at most: a trained policy moves faster."""
+SCALING = 1_000
+"""Actions from which the flow takes its scales."""
+LARGEST_STEP = 0.1
+"""Norm of the gradient at most, as published."""
+TRIES = 64
+_CHUNK = 2_000
+_FEASIBLE = 1e-6
+
+
+class DivergedError(Exception):
+    """The loss of a flow is not finite. The message is one line."""
+
+
+class FlowTraining:
+    """Trains the flow of `flow`, whose settings say how.
+
+    `obs` (n, k) are states of random play, the last `HELD_OUT` for measures. The same arguments give the same bits.
+    `stop_if_asked` raises to end the preparation. Raises a ConstraintError where the set breaks down at one of `obs`.
+    """
+
+    def __init__(
+        self, flow: Flow, constraint: Constraint, obs: Tensor, stop_if_asked: Callable[[], None] = lambda: None
+    ):
+        self.flow, self.constraint = flow, constraint
+        self.generator = torch.Generator().manual_seed(1)
+        self.step = 0
+        self.obs = self._further_out(obs[:-HELD_OUT], POOL, stop_if_asked)
+        self.test_obs = self._further_out(obs[-HELD_OUT:], HELD_OUT, stop_if_asked)
+        self.features = constraint.features(self.obs).float()
+        self.actions = self._feasible(self.obs if flow.flow == "mle" else self.obs[:SCALING], stop_if_asked)
+        self.test_actions = self._feasible(self.test_obs, stop_if_asked)
+        self.network = flow.new_network(constraint.dim, self.features.shape[-1])
+        self.network.standardize(self.features, self.actions)
+        self.optimizer = Adam(self.network.parameters(), flow.flow_learning_rate)
+        self.parameters = parameters_of(self.optimizer)
+
+    def _further_out(self, obs: Tensor, count: int, stop_if_asked: Callable[[], None]) -> Tensor:
+        """`count` of obs (n, k), moved to 0 to `FURTHEST` times their distance from the mean of all.
+
+        Where the set breaks down there, they stay where they are.
+        """
+        some = obs[torch.randint(len(obs), (count,), generator=self.generator)]
+        mean = obs.mean(0)
+        moved = mean + FURTHEST * torch.rand(count, 1, generator=self.generator) * (some - mean)
+        try:
+            for chunk in moved.split(_CHUNK):
+                stop_if_asked()
+                self.constraint.center(chunk)
+        except ConstraintError:  # a set of one's own need not exist where the robot cannot be
+            return some
+        return moved
+
+    def _feasible(self, obs: Tensor, stop_if_asked: Callable[[], None]) -> Tensor:
+        """An action (n, d) for each of obs (n, k), uniform in its set.
+
+        It is the first feasible one of `TRIES` in the box, which takes a small part of the time of `Constraint.sample`.
+        """
+        actions = []
+        for chunk in obs.split(_CHUNK):
+            stop_if_asked()
+            tries = 2.0 * torch.rand(len(chunk), TRIES, self.constraint.dim, generator=self.generator) - 1.0
+            feasible = self.constraint.violation(chunk.unsqueeze(1), tries) <= 0.0
+            action = tries[torch.arange(len(chunk)), feasible.int().argmax(1)]
+            left = ~feasible.any(1)
+            if left.any():
+                action[left] = self.constraint.sample(chunk[left], 1, self.generator).squeeze(-2)
+            actions.append(action)
+        return torch.cat(actions)
+
+    @property
+    def ended(self) -> bool:
+        return self.step == self.flow.flow_steps
+
+    def advance(self) -> None:
+        """One gradient step. Raises DivergedError."""
+        share = self.step / self.flow.flow_steps
+        self.optimizer.param_groups[0]["lr"] = self.flow.flow_learning_rate * 0.5 * (1 + math.cos(math.pi * share))
+        rows = torch.randint(len(self.obs), (self.flow.flow_batch_size,), generator=self.generator)
+        loss = (self._likelihood if self.flow.flow == "mle" else self._divergence)(rows).mean()
+        gradients = torch.autograd.grad(loss, self.parameters)
+        norm = torch.stack(torch._foreach_norm(gradients)).norm()
+        torch._foreach_mul_(gradients, (LARGEST_STEP / norm.clamp(min=LARGEST_STEP)).item())
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self.optimizer.step()
+        self.step += 1
+        if not math.isfinite(loss.item()):
+            raise DivergedError(f"its loss is {loss.item()} at step {self.step}")
+
+    def _likelihood(self, rows: Tensor) -> Tensor:
+        """The loss `mle` (batch,) at rows of the pool."""
+        x, log_det = self.network.encode(self.features[rows], self.actions[rows])
+        outside = (x.abs() - 1.0).clamp(min=0.0)
+        return log_det + 0.5 * (outside / self.flow.mle_softness).square().sum(-1)
+
+    def _divergence(self, rows: Tensor) -> Tensor:
+        """The loss `reverse` (batch,) at rows of the pool."""
+        x = 2.0 * torch.rand(len(rows), self.constraint.dim, generator=self.generator) - 1.0
+        x[::2] = on_faces(x[::2])
+        action, log_det = self.network.decode(self.features[rows], x)
+        outside = self.constraint.penalty(self.obs[rows], action) + (action.abs() - 1.0).clamp(min=0.0).sum(-1)
+        return outside / self.flow.reverse_softness - log_det
+
+    @torch.no_grad()
+    def measure(self) -> dict[str, float]:
+        """How good the flow is at other states of the same kind, with the same random numbers each time.
+
+        `accuracy` is the share of uniform points of the box that it decodes to feasible actions, `face_accuracy` that
+        of points of the box's faces, `recall` that of uniform feasible actions that it encodes into the box, and
+        `violation` the mean violation of decoded actions, where a feasible one counts as 0.
+        """
+        features = self.constraint.features(self.test_obs)
+        x = 2.0 * torch.rand(self.test_actions.shape, generator=torch.Generator().manual_seed(2)) - 1.0
+        violation, on_face = (
+            self.constraint.violation(self.test_obs, self.network.decode(features, each)[0])
+            for each in (x, on_faces(x))
+        )
+        encoded = self.network.encode(features, self.test_actions)[0]
+        return {
+            "accuracy": (violation <= _FEASIBLE).double().mean().item(),
+            "face_accuracy": (on_face <= _FEASIBLE).double().mean().item(),
+            "recall": (encoded.abs().amax(-1) <= 1.0).double().mean().item(),
+            "violation": violation.double().clamp(min=0.0).mean().item(),
+        }
+
+    def state(self) -> dict[str, Any]:
+        """What a training of the same arguments needs to go on with the same bits."""
+        optimizer = {
+            f"{number}.{key}": value.clone()
+            for number, parameter in enumerate(self.parameters)
+            for key, value in self.optimizer.state[parameter].items()
+        }
+        network = {name: value.clone() for name, value in self.network.state_dict().items()}
+        return {
+            "network": network, "optimizer": optimizer, "generator": self.generator.get_state(), "step": self.step
+        }  # fmt: skip
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state` has returned."""
+        self.network.load_state_dict(state["network"])
+        for name, value in state["optimizer"].items():
+            number, key = name.split(".")
+            self.optimizer.state[self.parameters[int(number)]][key].copy_(value)
+        self.generator.set_state(state["generator"])
+        self.step = state["step"]
+
+
+def on_faces(x: Tensor) -> Tensor:
+    """The points (..., d) of the box's faces that are on the rays from the origin through x."""
+    return x / x.abs().amax(-1, keepdim=True)

@@ -1,0 +1,229 @@
+"""The flow of a cell's map: trained before the first seed of its task and settings, then shared by all.
+
+    results/flows/<task>/<flow>-<checksum>/
+        settings.json    what the checksum is of: the settings of the flow and the definition of the task
+        training.csv     step, seconds, and the measures of `core.flow_training` at that step
+        checkpoint.pt    while the training is unfinished
+        flow.pt          the parameters; written last, so its presence means that the training is finished
+    results/flows/<task>/<flow>-<checksum>.lock
+                         while a process trains it; others wait for it
+
+Each run has the flow among its parameters too, so it needs this folder at its start only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+import envs
+from algos import ALGORITHMS
+from core.config import Config
+from core.flow import Flow
+from core.flow_training import DivergedError, FlowTraining
+from core.words import ConfigError
+from envs import TASKS
+from store.definition import Description
+from store.files import one_line, replace_file
+from store.interrupt import Interrupted
+from store.lock import LockedError, run_lock
+
+FOLDER = "flows"
+"""The folder of flows in that of results."""
+VERSION = 1
+"""Counts the changes of how flows are trained."""
+STATES = 20_000
+"""States of random play, of which `core.flow_training.HELD_OUT` are for measures."""
+ROBOTS = 40
+"""That play at the same time."""
+LONGEST_HOLD = 16
+"""Steps for which random play repeats an action, at most: new actions in each step would cancel each other."""
+MEASURES = 20
+"""How often a training is measured."""
+SECONDS = 60.0
+"""Time between checkpoints."""
+WAITING = 1.0
+"""Seconds between looks at a flow that another process trains."""
+GOOD = 0.99
+"""Accuracy below which a note says how much will be projected."""
+
+
+class FlowFolder:
+    """The folder of the flow of `config`; `task` describes its task, as definition.json does."""
+
+    def __init__(self, config: Config, flow: Flow, task: Description):
+        of_training = {name: value for name, value in asdict(flow).items() if name != "flow_entropy"}
+        settings = {"version": VERSION, "flow": of_training, "task": task}
+        self.settings = json.dumps(settings, indent=2, sort_keys=True) + "\n"
+        digest = hashlib.sha256(self.settings.encode()).hexdigest()[:12]
+        self.path = Path(config.results).expanduser() / FOLDER / config.env / f"{flow.flow}-{digest}"
+
+    def read(self) -> dict[str, Any] | None:
+        """The trained flow and its measures, None where there is none. ConfigError for a file that is damaged."""
+        return self._load("flow.pt")
+
+    def checkpoint(self) -> dict[str, Any] | None:
+        """What the training goes on from, None where it starts anew."""
+        try:
+            return self._load("checkpoint.pt")
+        except ConfigError as error:
+            print(f"{error}; the training of the flow starts again", file=sys.stderr)
+            return None
+
+    def _load(self, name: str) -> dict[str, Any] | None:
+        path = self.path / name
+        if not path.is_file():
+            return None
+        try:
+            return torch.load(path, weights_only=True)
+        except Exception as error:  # PyTorch raises whatever its unpickler and its archive reader do
+            raise ConfigError(f"{path} is damaged: {one_line(error) or type(error).__name__}") from error
+
+    def begin(self) -> None:
+        """Make the folder."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._replace("settings.json", self.settings)
+
+    def save(self, name: str, content: Mapping[str, Any]) -> None:
+        replace_file(self.path / f"{name}.pt", lambda file: torch.save(dict(content), file))
+
+    def save_curve(self, rows: list[dict[str, float]]) -> None:
+        lines = [",".join(rows[0]), *(",".join(map(repr, row.values())) for row in rows)]
+        self._replace("training.csv", "\n".join(lines) + "\n")
+
+    def finish(self, content: Mapping[str, Any]) -> None:
+        self.save("flow", content)
+        (self.path / "checkpoint.pt").unlink(missing_ok=True)
+
+    def _replace(self, name: str, text: str) -> None:
+        replace_file(self.path / name, lambda file: file.write(text.encode()))
+
+
+def flow_of(
+    config: Config, definition: Mapping[str, Description], stop_if_asked: Callable[[], None]
+) -> dict[str, Any] | None:
+    """The flow that the map of `config` needs, from its folder or trained now; None where the map needs none.
+
+    It has the parameters as `state` and the last row of training.csv as `measures`. `stop_if_asked` raises Interrupted
+    to end the training with a checkpoint. Raises ConfigError where the flow cannot be trained.
+    """
+    algorithm = ALGORITHMS[config.algo]
+    if not isinstance(algorithm.map, Flow):
+        return None
+    flow = cast("Flow", algorithm.map.configured(config))
+    folder = FlowFolder(config, flow, definition["task"])
+    while (trained := folder.read()) is None:
+        try:
+            with run_lock(folder.path):
+                if folder.read() is None:  # another process may have finished it since
+                    _train(config, flow, folder, stop_if_asked)
+        except LockedError as error:
+            print(f"waiting: {error}", file=sys.stderr)
+            _wait(folder, stop_if_asked)
+        except Interrupted:
+            print(f"interrupted in the training of {folder.path}; the same command resumes", file=sys.stderr)
+            raise
+    if trained["measures"]["accuracy"] < GOOD:
+        share = f"{100 * trained['measures']['accuracy']:.1f} %"
+        print(
+            f"note: the flow of {config.env} takes {share} of the box into the set; the rest is projected",
+            file=sys.stderr,
+        )
+    return trained
+
+
+def _wait(folder: FlowFolder, stop_if_asked: Callable[[], None]) -> None:
+    """Wait while another process trains the flow."""
+    while folder.read() is None:
+        stop_if_asked()
+        try:
+            with run_lock(folder.path):
+                return
+        except LockedError:
+            time.sleep(WAITING)
+
+
+def _train(config: Config, flow: Flow, folder: FlowFolder, stop_if_asked: Callable[[], None]) -> None:
+    """Train the flow, from its checkpoint where there is one, and save it."""
+    folder.begin()
+    before, rows, started = folder.checkpoint(), [], time.perf_counter()
+    interval = 0.5 if sys.stderr.isatty() else 60.0  # seconds, as of `core.progress`
+    name = f"{config.algo} {config.env} flow"
+    with tqdm(total=flow.flow_steps, desc=name, unit="step", mininterval=interval, maxinterval=interval) as bar:
+        training = FlowTraining(flow, TASKS[config.env].constraint, random_play(config, stop_if_asked), stop_if_asked)
+        if before is not None:
+            training.load_state(before["training"])
+            rows, started = before["rows"], started - before["seconds"]
+            bar.update(training.step)
+
+        def checkpoint() -> None:
+            seconds = time.perf_counter() - started
+            try:
+                folder.save("checkpoint", {"training": training.state(), "rows": rows, "seconds": seconds})
+            except OSError as error:
+                tqdm.write(f"no checkpoint of the flow at step {training.step}: {one_line(error)}", file=sys.stderr)
+
+        saved = time.perf_counter()
+        try:
+            while not training.ended:
+                stop_if_asked()
+                training.advance()
+                bar.update()
+                if training.step % max(flow.flow_steps // MEASURES, 1) == 0 or training.ended:
+                    seconds = time.perf_counter() - started
+                    rows.append({"step": training.step, "seconds": round(seconds, 2), **training.measure()})
+                    folder.save_curve(rows)
+                    bar.set_postfix(accuracy=f"{rows[-1]['accuracy']:.3f}", refresh=False)
+                if time.perf_counter() - saved > SECONDS:
+                    checkpoint()
+                    saved = time.perf_counter()
+        except Interrupted:
+            checkpoint()
+            raise
+        except DivergedError as error:
+            raise ConfigError(
+                f"the flow of {config.env} cannot be trained: {error}; try a smaller flow_learning_rate"
+            ) from error
+    folder.finish({"state": training.network.state_dict(), "measures": rows[-1]})
+
+
+def random_play(config: Config, stop_if_asked: Callable[[], None]) -> Tensor:
+    """`STATES` observations (n, k) of the task's robot under random actions, which are projected and kept for a while.
+
+    They are in the order of time, those of all robots after each other.
+    """
+    task, random = TASKS[config.env], np.random.default_rng(0)
+    robots = [envs.make(config.env, simulator=config.simulator) for _ in range(ROBOTS)]
+    try:
+        obs = np.stack([robot.reset(seed=number)[0] for number, robot in enumerate(robots)])
+        suggested = np.zeros((ROBOTS, task.constraint.dim))
+        left = np.zeros(ROBOTS, np.int64)
+        seen = []
+        for _ in range(STATES // ROBOTS):
+            stop_if_asked()
+            fresh = left == 0
+            suggested[fresh] = random.uniform(-2.0, 2.0, (fresh.sum(), task.constraint.dim)).clip(-1.0, 1.0)
+            left[fresh] = random.integers(1, LONGEST_HOLD + 1, fresh.sum())
+            left -= 1
+            seen.append(torch.from_numpy(obs).float())
+            actions = task.constraint.project(seen[-1], torch.from_numpy(suggested).float())
+            for i, outcome in enumerate(envs.step_together(robots, actions.numpy())):
+                if isinstance(outcome, Exception):
+                    raise outcome
+                arrived, _, terminated, truncated, _ = outcome
+                obs[i] = robots[i].reset()[0] if terminated or truncated else arrived
+    finally:
+        for robot in robots:
+            robot.close()
+    return torch.cat(seen)

@@ -1,0 +1,226 @@
+"""The training of a cell's flow, before its seeds: once, interrupted, resumed, damaged, shared."""
+
+import json
+import shutil
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from helpers import Breaks, assert_identical, config_of, outcome, run_command, train, train_through
+
+import envs
+from algos import ALGORITHMS, load_policy
+from core import flow_training
+from core.flow import Flow
+from store.folder import find_runs, read_run
+from store.interrupt import Interrupted
+from store.lock import run_lock
+from sweep import flows
+from sweep.definition import define
+
+pytestmark = pytest.mark.usefixtures("small_flows")
+
+WORDS = (
+    "algo=DFlow env=R+O10 seed=3,5 steps=80 learning_starts=20 batch_size=8 hidden=[8,8] train_freq=1 gradient_steps=1"
+    " eval_every=40 eval_episodes=1 final_episodes=1"
+)
+SAC_WORDS = WORDS.replace("DFlow", "SFlow").replace("R+O10", "H+M")
+
+
+def flow_folders(root):
+    return sorted(path for path in root.glob("flows/*/*") if path.is_dir())
+
+
+def folder_of(root, words=WORDS):
+    config = config_of(f"{words} results={root}")
+    flow = ALGORITHMS[config.algo].map.configured(config)
+    return flows.FlowFolder(config, flow, define(config.env, config.algo)["task"])
+
+
+def clock(sleep):
+    """In the place of the module `time`."""
+    return SimpleNamespace(sleep=sleep, perf_counter=time.perf_counter)
+
+
+@pytest.mark.parametrize("words", [WORDS, SAC_WORDS], ids=["DFlow", "SFlow"])
+def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path, capsys, words):
+    """In random play, in the training of the flow, in warm-up, between gradient steps, in evaluations."""
+    whole = Breaks()
+    train(tmp_path / "whole", words, whole)
+    check = Breaks(*range(5, whole.calls, whole.calls // 9))
+    assert train_through(tmp_path / "broken", words, check) >= 8
+    assert "interrupted in the training of" in capsys.readouterr().err
+    assert_identical(outcome(tmp_path / "whole"), outcome(tmp_path / "broken"))
+    one, other = (flow_folders(tmp_path / root)[0] for root in ("whole", "broken"))
+    assert one.name == other.name and {path.name for path in other.iterdir()} == {path.name for path in one.iterdir()}
+    first, second = (torch.load(folder / "flow.pt", weights_only=True)["state"] for folder in (one, other))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_a_seed_learns_the_same_alone_and_in_lockstep(tmp_path):
+    """They share the flow, and nothing else."""
+    for root, seeds in (("together", "3,5"), ("alone", "5")):
+        train(tmp_path / root, SAC_WORDS.replace("3,5", seeds))
+    last = {}
+    for root in ("together", "alone"):
+        (run,) = (folder for folder in find_runs(tmp_path / root) if folder.name == "seed=5")
+        last[root] = torch.load(run / "last.pt", weights_only=True)
+    assert last["together"].keys() == last["alone"].keys() and any(name.startswith("map.") for name in last["alone"])
+    for name, value in last["alone"].items():
+        torch.testing.assert_close(last["together"][name], value, rtol=1e-3, atol=1e-3)
+
+
+def test_a_flow_is_trained_once_for_a_task_and_settings(tmp_path, monkeypatch):
+    train(tmp_path, WORDS.replace("3,5", "3"))
+    (folder,) = flow_folders(tmp_path)
+    assert {path.name for path in folder.iterdir()} == {"settings.json", "training.csv", "flow.pt"}
+    with monkeypatch.context() as patched:
+        patched.setattr(flows, "FlowTraining", lambda *arguments: pytest.fail("trained again"))
+        train(tmp_path, WORDS.replace("3,5", "5"))
+        train(tmp_path, WORDS.replace("DFlow", "SFlow"))
+        train(tmp_path, WORDS.replace("DFlow", "SFlow") + " flow_entropy=latent")
+    train(tmp_path, f"{WORDS} flow=mle")
+    train(tmp_path, f"{WORDS} flow_steps=21")
+    assert len(flow_folders(tmp_path)) == 3
+    monkeypatch.setattr(envs.TASKS["R+O10"].constraint, "bound", 0.9)  # its definition, which is all that counts
+    train(tmp_path, WORDS.replace("3,5", "8"))
+    assert len(flow_folders(tmp_path)) == 4
+
+
+def test_what_a_training_leaves(tmp_path):
+    train(tmp_path, WORDS)
+    (folder,) = flow_folders(tmp_path)
+    header, *rows = (folder / "training.csv").read_text().splitlines()
+    assert header == "step,seconds,accuracy,face_accuracy,recall,violation"
+    rows = np.array([[float(x) for x in row.split(",")] for row in rows])
+    assert rows[:, 0].tolist() == list(range(1, 21)) and (np.diff(rows[:, 1]) >= 0).all()
+    assert ((rows[:, 2:5] > 0) & (rows[:, 2:5] <= 1)).all()
+    settings = json.loads((folder / "settings.json").read_text())
+    assert settings["flow"]["flow"] == "reverse" and settings["flow"]["flow_steps"] == 20
+    for run in find_runs(tmp_path):
+        assert json.loads((run / "info.json").read_text())["flow"]["accuracy"] == rows[-1, 2]
+
+
+def test_a_run_keeps_its_flow(tmp_path):
+    """A policy needs the folder of the run and nothing else; training.csv tells how much is projected."""
+    train(tmp_path, f"{WORDS} flow=mle")
+    obs = np.random.default_rng(0).normal(size=(40, 9))
+    (run, _) = find_runs(tmp_path)
+    before = load_policy(run)(obs)
+    shutil.rmtree(tmp_path / "flows")
+    moved = tmp_path / "elsewhere" / "R+O10" / "x" / run.name
+    shutil.copytree(run, moved)
+    policy = load_policy(moved)
+    assert np.array_equal(policy(obs), before)
+    assert policy.constraint.violation(torch.from_numpy(obs).float(), torch.from_numpy(before)).max() <= 1e-6
+    assert run_command(["play", str(run), "episodes=1"]) == 0
+
+
+def test_training_csv_has_the_share_that_is_projected(tmp_path, monkeypatch):
+    """It is that of decoded actions, not of the points of the box that the actor suggests."""
+    monkeypatch.setattr(Flow, "propose", lambda self, constraint, obs, suggested: 0.0 * suggested + 5.0)
+    train(tmp_path, WORDS.replace("3,5", "3"))
+    (run,) = find_runs(tmp_path)
+    training = read_run(run).training
+    assert (training["suggested_infeasible"] == 1).all() and (training["suggested_violation"] >= 4).all()
+    assert read_run(run).result["largest_violation"] <= 1e-6
+
+
+# ---------------------------------------------------------------- faults
+
+
+def test_a_flow_that_diverges_is_one_line(tmp_path, capsys):
+    words = [*WORDS.split(), f"results={tmp_path}", "flow_learning_rate=1e30"]
+    assert run_command(words) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("run.py: the flow of R+O10 cannot be trained: its loss is ")
+    assert said.endswith("; try a smaller flow_learning_rate")
+    assert not find_runs(tmp_path)
+
+
+def test_a_damaged_flow_is_refused_and_a_damaged_checkpoint_starts_again(tmp_path, capsys):
+    words = [*WORDS.split(), f"results={tmp_path}"]
+    train(tmp_path / "whole", WORDS)
+    with pytest.raises(Interrupted):
+        train(tmp_path, WORDS, Breaks(flows.STATES // flows.ROBOTS + 15))
+    (folder,) = flow_folders(tmp_path)
+    assert (folder / "checkpoint.pt").is_file() and not (folder / "flow.pt").exists()
+    (folder / "checkpoint.pt").write_bytes(b"no checkpoint")
+    assert run_command(words) == 0
+    assert f"{folder / 'checkpoint.pt'} is damaged" in capsys.readouterr().err
+    assert_identical(outcome(tmp_path / "whole"), {name: run for name, run in outcome(tmp_path).items()})
+    (folder / "flow.pt").write_bytes(b"no flow")
+    assert run_command([*words, "overwrite=true"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"run.py: {folder / 'flow.pt'} is damaged: ")
+
+
+def test_a_process_waits_for_another_that_trains_the_same_flow(tmp_path, monkeypatch, capsys):
+    train(tmp_path / "whole", WORDS)
+    folder, looked = folder_of(tmp_path), threading.Event()
+    folder.begin()
+    with run_lock(folder.path):
+
+        def finish():
+            looked.wait()
+            shutil.copy(flow_folders(tmp_path / "whole")[0] / "flow.pt", folder.path / "flow.pt")
+
+        other = threading.Thread(target=finish)
+        other.start()
+        monkeypatch.setattr(flows, "time", clock(lambda seconds: looked.set()))
+        train(tmp_path, WORDS)
+        other.join()
+    assert f"waiting: {folder.path} is being trained by process" in capsys.readouterr().err
+    assert_identical(outcome(tmp_path / "whole"), outcome(tmp_path))
+
+
+def test_a_process_takes_over_from_another_that_ended_without_a_flow(tmp_path, monkeypatch):
+    folder = folder_of(tmp_path)
+    folder.begin()
+    lock = run_lock(folder.path)
+    lock.__enter__()
+    monkeypatch.setattr(flows, "time", clock(lambda seconds: lock.__exit__(None, None, None)))
+    train(tmp_path, WORDS)
+    assert len(find_runs(tmp_path)) == 2 and folder.read()["measures"]["step"] == 20
+
+
+def test_a_flow_that_leaves_much_outside_is_noted(tmp_path, capsys):
+    train(tmp_path, f"{WORDS} flow_steps=1")
+    assert "note: the flow of R+O10 takes " in capsys.readouterr().err
+
+
+def test_the_checkpoint_of_a_flow_cannot_be_written(tmp_path, monkeypatch, capsys):
+    """The training of the flow goes on without it."""
+    original = flows.replace_file
+
+    def full(path, write):
+        if path.name == "checkpoint.pt":
+            raise OSError(28, "No space left on device", str(path))
+        original(path, write)
+
+    monkeypatch.setattr(flows, "SECONDS", 0.0)
+    monkeypatch.setattr(flows, "replace_file", full)
+    train(tmp_path, WORDS)
+    assert "no checkpoint of the flow at step 1: no space left on device" in capsys.readouterr().err
+    assert len(find_runs(tmp_path)) == 2
+
+
+def test_play_at_random_stays_feasible_and_repeats_itself():
+    config = config_of("algo=DFlow env=H+M")
+    first, second = (flows.random_play(config, lambda: None) for _ in range(2))
+    assert torch.equal(first, second) and first.shape == (400, 11) and first.isfinite().all()
+    assert first[:, 8:11].std() > 1.0  # it moves
+    assert len(first) > flow_training.HELD_OUT
+
+
+@pytest.mark.parametrize("words, said", [("flow=both", "must be 'mle' or 'reverse'"), ("flow_steps=0", "at least 1")])
+def test_wrong_settings_are_one_line(words, said, capsys):
+    assert run_command(["algo=DFlow", "env=R+L2", words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_other_algorithms_have_no_settings_of_flows(capsys):
+    assert run_command(["algo=DGauge", "env=R+L2", "flow=mle"]) == 2
+    assert "flow does not apply to DGauge on R+L2" in capsys.readouterr().err

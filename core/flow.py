@@ -131,8 +131,9 @@ class ConditionalFlow(nn.Module):
 class Flow(Map):
     """A trained flow, and the projection of what it leaves outside the set.
 
-    The suggestion is a point of the box, which the flow decodes. The log-density is that of the decoded action, before
-    the projection. `load_state` gives it a flow that `core.flow_training` has trained; RuntimeError before that.
+    The suggestion is a point of the box, which the flow decodes. The log-density is that of the suggestion or, with
+    `flow_entropy=action`, of the decoded action before the projection. `load_state` gives it a flow that
+    `core.flow_training` has trained; RuntimeError before that.
     """
 
     flow: str = setting(
@@ -148,9 +149,9 @@ class Flow(Map):
     reverse_softness: float = setting(1e-4, "DFlow, SFlow: width of the set's edges, for flow=reverse", POSITIVE)
 
     flow_entropy: str = setting(
-        "action",
-        "SFlow: entropy of the 'action', or of the 'latent' point of the box as in CV-Flow",
-        one_of("action", "latent"),
+        "latent",
+        "SFlow: entropy of the 'latent' point of the box, as in CV-Flow, or of the 'action'",
+        one_of("latent", "action"),
         of_density=True,
     )
 

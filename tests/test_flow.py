@@ -94,7 +94,7 @@ def test_a_flow_without_features_is_the_same_everywhere():
 
 
 def flow_map(constraint=CONSTRAINT, seed=0, obs_dim=3):
-    map = Flow(flow_width=8)
+    map = Flow(flow_width=8, flow_entropy="action")
     map.use_untrained(constraint, torch.zeros(1, obs_dim))
     dim, features = constraint.dim, constraint.features(torch.zeros(1, obs_dim)).shape[-1]
     map.load_state(random_flow(dim, features, seed, double=False).state_dict())
@@ -132,7 +132,7 @@ def test_the_maps_density_is_the_suggestions_over_the_determinant():
     sample = Sample(suggested, torch.zeros(40, 2), torch.ones(40, 2), zero + 0.7)
     action, log_prob = map.with_log_prob(CONSTRAINT, obs, sample, None)
     torch.testing.assert_close(action, map(CONSTRAINT, obs, suggested, None))
-    latent = Flow(flow_entropy="latent", flow_width=8)
+    latent = Flow(flow_width=8)
     latent.load_state(map.state())
     same, of_suggestion = latent.with_log_prob(CONSTRAINT, obs, sample, None)
     assert torch.equal(same, action) and torch.equal(of_suggestion, sample.log_prob)

@@ -81,7 +81,7 @@ def test_a_flow_is_trained_once_for_a_task_and_settings(tmp_path, monkeypatch):
         patched.setattr(flows, "FlowTraining", lambda *arguments: pytest.fail("trained again"))
         train(tmp_path, WORDS.replace("3,5", "5"))
         train(tmp_path, WORDS.replace("DFlow", "SFlow"))
-        train(tmp_path, WORDS.replace("DFlow", "SFlow") + " flow_entropy=latent")
+        train(tmp_path, WORDS.replace("DFlow", "SFlow") + " flow_entropy=action")
     train(tmp_path, f"{WORDS} flow=mle")
     train(tmp_path, f"{WORDS} flow_steps=21")
     assert len(flow_folders(tmp_path)) == 3

@@ -3,6 +3,7 @@
     python bench/gpu.py                                       # at most 9 minutes, into bench/results/gpu
     python bench/gpu.py minutes=5 parts=updates,runs out=FOLDER
     python bench/gpu.py device=cpu parts=updates seeds=1      # the same on a CPU
+    python bench/gpu.py parts=updates base=TD3,SAC task=R+L2,HC+O seeds=1,10,30 steps=200       # the defaults of a part
 
 The parts come in this order, and each result is saved as soon as it is there, so that an early end leaves the rest:
 

@@ -146,8 +146,8 @@ def difference(agent: Agent, other: Agent) -> float:
     return max(found)
 
 
-class _Enough(Exception):
-    """Ends a training loop from within."""
+class _Enough(BaseException):
+    """Ends a training loop from within. The loop reports an Exception as an error."""
 
 
 def measure_run(base: str, task: str, seeds: int, threads: int, device: torch.device) -> dict[str, Any]:

@@ -2,13 +2,14 @@
 
     python bench/publish.py results/                         # every cell of it, to docs/data
     python bench/publish.py results/ env=R+L2 algo=DPre+     # these cells only
+    python bench/publish.py results/ settings=any            # runs of a study, with other settings than the paper's
     python bench/publish.py results/ out=DIR                 # to another folder
 
 A cell (task, algorithm and settings) is published with all its seeds or not at all, so that no seed is dropped. It is
 refused where a run has not ended, where its provenance is missing, names uncommitted changes or more than one commit,
-and where its settings are not those that its folder says. A seed that is published already stays as it is, and a second
-run of it is refused alone. The command names every refused run with the reason, publishes the rest, and exits with code
-1.
+where its settings are not those that its folder says and, without `settings=any`, where they are not the paper's. A
+seed that is published already stays as it is, and a second run of it is refused alone. The command names every refused
+run with the reason, publishes the rest, and exits with code 1.
 
 The files are described in store/published.py; `python plot.py docs/data` makes tables and figures from them.
 """
@@ -41,12 +42,14 @@ class RefusedError(Exception):
     """A run that must not be published; the message says why."""
 
 
-def publish(root: Path, out: Path, tasks: Sequence[str], algos: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Publish the cells of `root`; the published runs and the refused ones, a line each."""
+def publish(
+    root: Path, out: Path, tasks: Sequence[str] | None, algos: Sequence[str] | None, any_settings: bool
+) -> tuple[list[str], list[str]]:
+    """Publish the cells of `root`; the published runs and the refused ones, a line each. None stands for all names."""
     cells: dict[tuple[str, str], list[Path]] = defaultdict(list)
     for folder in find_runs(root):
         task, variant = folder.parent.parent.name, folder.parent.name
-        if task in tasks and parse_variant(variant)[0] in algos:
+        if (tasks is None or task in tasks) and (algos is None or parse_variant(variant)[0] in algos):
             cells[task, variant].append(folder)
     if not cells:
         raise ConfigError(f"no runs of these tasks and algorithms in {root}")
@@ -57,7 +60,7 @@ def publish(root: Path, out: Path, tasks: Sequence[str], algos: Sequence[str]) -
         ready, problems = [], []
         for folder in folders:
             try:
-                run = checked(folder)
+                run = checked(folder, any_settings)
             except RefusedError as error:
                 problems.append(f"{folder}: {error}")
                 continue
@@ -77,7 +80,7 @@ def publish(root: Path, out: Path, tasks: Sequence[str], algos: Sequence[str]) -
     return published, refused
 
 
-def checked(folder: Path) -> PublishedRun:
+def checked(folder: Path, any_settings: bool) -> PublishedRun:
     """The run in `folder`. Raises RefusedError with the reason why it must not be published."""
     if not has_ended(folder):
         raise RefusedError("it has not ended")
@@ -87,7 +90,7 @@ def checked(folder: Path) -> PublishedRun:
     except (OSError, ValueError) as error:
         raise RefusedError(one_line(error)) from error
     _check_provenance(info)
-    _check_settings(run)
+    _check_settings(run, any_settings)
     return PublishedRun(run, info)
 
 
@@ -102,7 +105,7 @@ def _check_provenance(info: Mapping[str, Any]) -> None:
         raise RefusedError(f"its parts ran at different commits: {', '.join(commits)}")
 
 
-def _check_settings(run: Run) -> None:
+def _check_settings(run: Run, any_settings: bool) -> None:
     if run.task not in TASKS or run.algo not in ALGORITHMS:
         raise RefusedError(f"{run.algo} on {run.task} is not of this project")
     config = saved_config(run.config)
@@ -110,6 +113,9 @@ def _check_settings(run: Run) -> None:
     for says, holds in ((run.task, config.env), (run.variant, variant), ((run.seed,), config.seeds)):
         if says != holds:
             raise RefusedError(f"its folder says {says}, its config.yaml {holds}")
+    if run.overrides and not any_settings:
+        changed = " ".join(f"{key}={value}" for key, value in run.overrides.items())
+        raise RefusedError(f"its settings are not the paper's: {changed} (settings=any publishes it)")
     if run.result is not None and run.result["steps"] != config.steps:
         raise RefusedError(f"it has {run.result['steps']} steps of {config.steps}")
 
@@ -120,12 +126,15 @@ def main(argv: Sequence[str]) -> int:
         return 0 if argv and argv[0] in ("-h", "--help") else 2
     root = Path(argv[0]).expanduser()
     try:
-        words = parse_words(argv[1:], ("env", "algo", "out"))
+        words = parse_words(argv[1:], ("env", "algo", "out", "settings"))
         if not root.is_dir():
             raise ConfigError(f"{root} is not a folder")
-        tasks = split_names("task", words.get("env", "all"), TASKS)
-        algos = split_names("algorithm", words.get("algo", "all"), ALGORITHMS)
-        published, refused = publish(root, Path(words.get("out", OUT)).expanduser(), tasks, algos)
+        tasks = split_names("task", words["env"], TASKS) if "env" in words else None
+        algos = split_names("algorithm", words["algo"], ALGORITHMS) if "algo" in words else None
+        if words.get("settings", "any") != "any":
+            raise ConfigError(f"bad value {words['settings']!r} for settings (choices: any)")
+        out = Path(words.get("out", OUT)).expanduser()
+        published, refused = publish(root, out, tasks, algos, "settings" in words)
     except (ConfigError, ValueError) as error:
         print(f"publish.py: {one_line(error)}", file=sys.stderr)
         return 2

@@ -1,7 +1,8 @@
 """Gradient steps of several processes on one GPU, which take turns or share it through NVIDIA's MPS.
 
     python bench/shared_gpu.py                          # 1, 4 and 8 processes with ten seeds of DPre on R+L2
-    python bench/shared_gpu.py processes=1,2 algo=SPre env=HC+O seeds=3
+    python bench/shared_gpu.py processes=1,2 algo=SPre env=HC+O seeds=3 seconds=5
+    python bench/shared_gpu.py device=cpu processes=1,2
 
 It prints a line for each number of processes, without and with the Multi-Process Service, where that is installed.
 """
@@ -23,12 +24,15 @@ from algos import ALGORITHMS
 from bench.common import agent_of, fill_replay, make_config
 from bench.mps import shared_gpu
 from core.cuda_graph import GradientSteps
-from core.words import ConfigError, parse_words, split_names, whole_number, whole_numbers
+from core.words import ConfigError, known_name, parse_words, whole_number, whole_numbers
 from envs import TASKS
+from sweep.train import check_device
 
 DEFAULTS = {"algo": "DPre", "env": "R+L2", "seeds": "10", "processes": "1,4,8", "seconds": "3", "device": "cuda"}
 TRANSITIONS, BLOCK = 300, 50
 """Of each seed; gradient steps before a look at the clock."""
+NUMBER = "--number="
+"""The last word of each process that measures."""
 PAUSE = 0.5
 """Seconds between two measurements."""
 
@@ -67,7 +71,7 @@ def measure(options: dict[str, str], environment: dict[str, str]) -> list[float]
     words = [f"{key}={value}" for key, value in options.items()]
     running = [
         subprocess.Popen(
-            [sys.executable, __file__, *words, f"number={number}"],
+            [sys.executable, __file__, *words, f"{NUMBER}{number}"],
             env=os.environ | {"OMP_NUM_THREADS": "1"} | environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -91,13 +95,17 @@ def main(arguments: list[str]) -> int:
         print(__doc__.strip())
         return 0
     try:
-        words = parse_words(arguments, [*DEFAULTS, "number"])
-        options = DEFAULTS | {key: value for key, value in words.items() if key in DEFAULTS}
-        split_names("algorithm", options["algo"], ALGORITHMS)
-        split_names("task", options["env"], TASKS)
+        words = list(arguments)
+        number = words.pop().removeprefix(NUMBER) if words and words[-1].startswith(NUMBER) else ""
+        options = DEFAULTS | parse_words(words, DEFAULTS)
+        known_name("algorithm", options["algo"], ALGORITHMS)
+        known_name("task", options["env"], TASKS)
+        check_device(options["device"])
         processes = whole_numbers("processes", options["processes"])
-        if "number" in words:
-            take_steps(options, int(words["number"]), processes)
+        whole_number("seeds", options["seeds"])
+        whole_number("seconds", options["seconds"])
+        if number:
+            take_steps(options, int(number), processes)
             return 0
         print("processes: updates of single seeds a second", *processes, sep="\t")
         print("taking turns", *(f"{rate:,.0f}" for rate in measure(options, {})), sep="\t", flush=True)

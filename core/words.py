@@ -31,9 +31,10 @@ class NameTable(MutableMapping[str, Row]):
     def __setitem__(self, name: str, row: Row) -> None:
         self.check_free(name)
         if not isinstance(name, str) or not re.fullmatch(r"[^\s,/\\=.][^\s,/\\=]*", name) or name in GROUPS:
+            article = "an" if self.kind[0] in "aeiou" else "a"
             raise ValueError(
-                f"{name!r} cannot be the name of a {self.kind}: no space, comma, '=' or slash, no leading '.', and none"
-                f" of {', '.join(GROUPS)}"
+                f"{name!r} cannot be the name of {article} {self.kind}: no space, comma, '=' or slash, no leading '.',"
+                f" and none of {', '.join(GROUPS)}"
             )
         self._rows[name] = row
 

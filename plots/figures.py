@@ -128,6 +128,8 @@ def _draw_training(
             axes.remove()
         for axes in (first, *others[: len(measures)]):
             axes.tick_params(labelbottom=True)  # sharing leaves them to the last row, where a column may have no panel
+    panels[0][0].autoscale(axis="x")  # the panels share it, and the first row alone had set its end
+    panels[0][0].set_xlim(left=0)
     figure.suptitle(fill(", ".join([f"{task} (mean ± standard error)", *common]), 110))
     longest = max(len(curve.label) for curve in curves)
     figure.legend(loc="outside lower center", ncols=max(1, min(len(curves), 100 // (longest + 8))), frameon=False)

@@ -158,4 +158,6 @@ def test_processes_are_measured_beside_each_other(capfd):
     title, turns = capfd.readouterr().out.splitlines()
     assert title.split("\t")[1:] == ["1", "2"]
     assert all(float(rate.replace(",", "")) > 0 for rate in turns.split("\t")[1:])
-    assert sharing.main(["processes=0"]) == 2
+    for wrong in ("processes=0", "algo=DPre,SPre", "env=R+L3", "seconds=-1", "device=tpu"):
+        assert sharing.main([wrong]) == 2
+        assert len(capfd.readouterr().err.splitlines()) == 1

@@ -552,6 +552,19 @@ def test_training_measures_side_by_side(tmp_path, monkeypatch):
     assert (tmp_path / "figures" / "R+L2-training.pdf").exists()
 
 
+@pytest.mark.parametrize("longer", ["SRad", "DRad"])
+def test_no_curve_is_cut_where_the_rows_of_a_figure_have_different_lengths(tmp_path, monkeypatch, longer):
+    for algo, measure in (("SRad", "temperature"), ("DRad", "mean_q")):
+        writer = write_run(tmp_path, "R+L2", algo, 0, evaluations=12 if algo == longer else 3)
+        writer.append_statistics(10_000, {measure: 1.0})
+    drawn = {}
+    monkeypatch.setattr(figures, "save", lambda figure, folder, name, formats: drawn.setdefault(name, figure) and [])
+    assert plot.main([str(tmp_path)]) == 0
+    panels = drawn["R+L2-training"].axes
+    last = max(line.get_xdata().max() for axes in panels for line in axes.lines)
+    assert all(axes.get_xlim()[0] == 0 and last <= axes.get_xlim()[1] <= 1.1 * last for axes in panels)
+
+
 @pytest.mark.parametrize("last", [0.2, 40.0, 1e17])
 def test_temperatures_have_ticks_over_any_range(tmp_path, monkeypatch, last):
     writer = write_run(tmp_path, "R+T", "SRad", 0)

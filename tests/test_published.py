@@ -110,6 +110,28 @@ def test_a_refused_run_keeps_its_whole_cell_back(results, tmp_path, capsys, reas
     assert [run.key for run in read_published(tmp_path / "data")] == [("SRad", "SRad", 0), ("SRad", "SRad", 1)]
 
 
+def test_runs_with_other_settings_than_the_papers_are_published_for_the_asking_alone(results, tmp_path, capsys):
+    short = results / "R+L2" / "SRad,steps=90"
+    (results / "R+L2" / "SRad").rename(short)
+    for seed in (0, 1):
+        edited("config.yaml", {"steps": 90})(short / f"seed={seed}")
+        edited("result.json", {"steps": 90})(short / f"seed={seed}")
+    assert publish(results, tmp_path / "data") == 1
+    assert "its settings are not the paper's: steps=90 (settings=any publishes it)" in capsys.readouterr().err
+    assert {run.run.algo for run in read_published(tmp_path / "data")} == {"DPre"}
+    assert publish(results, tmp_path / "data", "settings=any") == 0
+    assert {run.run.algo for run in read_published(tmp_path / "data")} == {"DPre", "SRad"}
+    assert publish(results, tmp_path / "data", "settings=all") == 2
+
+
+def test_a_run_of_an_algorithm_of_ones_own_is_named(results, tmp_path, capsys):
+    (results / "R+L2" / "SRad").rename(results / "R+L2" / "Mine")
+    for seed in (0, 1):
+        edited("config.yaml", {"algo": "Mine"})(results / "R+L2" / "Mine" / f"seed={seed}")
+    assert publish(results, tmp_path / "data") == 1
+    assert "Mine on R+L2 is not of this project" in capsys.readouterr().err
+
+
 def test_a_published_run_is_not_replaced_and_other_seeds_of_its_cell_come_beside_it(results, tmp_path, capsys):
     out, other = tmp_path / "data", tmp_path / "other"
     shutil.copytree(results, other)

@@ -116,7 +116,8 @@ class ARAM(Agent):
         self.rejected, self.steps = (zeros(1, dtype=torch.int64) for _ in range(2))  # actions and steps so far
         self.missing = zeros(config.snapshots) + torch.inf  # for each earlier critic 0, or inf where there is none yet
         self.copies = torch.zeros(seeds, dtype=torch.int64)  # of the critic, so far
-        self.measures = torch.zeros(seeds, 2)  # means: rejected draws a step, share of steps that project
+        # Means over steps: rejected draws, share of steps that project, share of the draws that are feasible.
+        self.measures = torch.zeros(seeds, 3)
         self.entropy = zeros(1)  # of the policy at the last batch's states
         self.last_losses = {name: zeros() for name in ("critic_loss", "actor_loss")}
 
@@ -149,7 +150,7 @@ class ARAM(Agent):
     def act(self, obs: Tensor, center: Tensor | None, warming_up: Sequence[int], exploring: Sequence[int]) -> Action:
         """Draw until an action is feasible; after `most_rejections` rejected draws, project the last one.
 
-        All draws of all seeds are made and checked at once, and those after the first feasible one are dropped.
+        All draws of all seeds are made and checked at once. Those after the first feasible one only count in a measure.
         """
         seeds, draws = len(self.seeds), self.config.most_rejections
         candidates = torch.zeros(seeds, draws, self.action_dim)
@@ -165,7 +166,7 @@ class ARAM(Agent):
         executed = suggested
         if exhausted.any():
             executed = torch.where(exhausted.unsqueeze(-1), self.feasible(obs, suggested, None), suggested)
-        self.remember([*warming_up, *exploring], obs, candidates, rejected)
+        self.remember([*warming_up, *exploring], obs, candidates, rejected, feasible.float().mean(-1))
         return Action(suggested, executed, suggested)
 
     def draw(self, obs: Tensor, which: Sequence[int]) -> Tensor:
@@ -179,10 +180,13 @@ class ARAM(Agent):
     def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
         return self.draw(obs, which)[:, 0]
 
-    def remember(self, which: Sequence[int], obs: Tensor, candidates: Tensor, rejected: Tensor) -> None:
+    def remember(
+        self, which: Sequence[int], obs: Tensor, candidates: Tensor, rejected: Tensor, feasible: Tensor
+    ) -> None:
         """Count a step of the seeds `which` and keep their rejected actions, the first ones of `candidates`.
 
-        obs (seeds, n), candidates (seeds, draws, d) and how many are rejected (seeds,) are on the CPU.
+        obs (seeds, n), candidates (seeds, draws, d), how many are rejected (seeds,) and which share of all candidates
+        is feasible (seeds,) are on the CPU.
         """
         kept, draws = self.config.rejected_kept, candidates.shape[1]
         stepped = torch.zeros(len(self.seeds), dtype=torch.int64)
@@ -196,7 +200,7 @@ class ARAM(Agent):
             self.rejections[seeds, (self.rejected[seeds, 0] + numbers) % kept] = rows
             self.rejected += count.to(self.device)
         self.steps += stepped.unsqueeze(-1).to(self.device)
-        now = torch.cat([count, count == draws], dim=-1).float()
+        now = torch.cat([count, count == draws, feasible.unsqueeze(-1)], dim=-1)
         weight = stepped / self.steps.cpu()[:, 0].clamp(min=1, max=MEASURED_STEPS)
         self.measures.lerp_(now, weight.unsqueeze(-1))
 
@@ -314,12 +318,15 @@ class ARAM(Agent):
             self.copies[i] += 1
 
     def statistics(self) -> dict[str, Tensor]:
-        """Measures of the last thousand steps or so: the share of draws that were feasible, rejected draws a step, and
-        the share of steps that projected as all draws were rejected. The others are of the last gradient step."""
-        rejected, fallbacks = self.measures.unbind(-1)
-        accepted = 1.0 - fallbacks
+        """Measures of the last thousand steps or so: the share of a step's draws that are feasible, rejected draws a
+        step, and the share of steps that project as all draws are rejected. The others are of the last gradient step.
+
+        The first one weighs each step alike. Accepted draws over all draws until then would not: a few states where
+        nearly no draw is feasible have most of the draws.
+        """
+        rejected, fallbacks, acceptance = self.measures.unbind(-1)
         return {
-            "acceptance_rate": accepted / (rejected + accepted),
+            "acceptance_rate": acceptance,
             "rejected_draws": rejected,
             "fallbacks": fallbacks,
             "temperature": self.temperature.log_alpha.detach().exp()[:, 0],

@@ -48,7 +48,7 @@ def make(name, task="W+M", device="cpu"):
             centers = agent.centers(obs), agent.centers(next_obs)
             replay.add([0, 1], Batch(obs, action, reward, terminated, next_obs, *centers))
             if name == "ARAM" and device != "meta":  # it has a second buffer
-                agent.remember([0, 1], obs, uniform.unsqueeze(1), torch.tensor([1, 1]))
+                agent.remember([0, 1], obs, uniform.unsqueeze(1), torch.tensor([1, 1]), torch.zeros(2))
 
     grow(20)
     return agent, replay, grow

@@ -37,7 +37,7 @@ class ARAMConfig(Config):
     """ARAM's own settings. The defaults are the constants of its published code, but for docs/deviations.md.
 
     A rejection costs, beside its penalty, the delay of all later rewards: (1 - gamma) times their value. Where that is
-    not positive, waiting pays, and the policy does not learn to be feasible. So `reward_shift` makes rewards larger.
+    not positive, the delay is a gain and works against the penalty. So `reward_shift` can make rewards larger.
     """
 
     temperature: float = setting(0.2, "ARAM: weight of the entropy at the start", POSITIVE)

@@ -3,7 +3,7 @@
 The policy is asked again until it suggests a feasible action. A rejected suggestion is an experience too: it leads from
 a state back to the same state at the cost of a penalty. So there are two rewards, that of the task and minus the
 penalty, and a preference lambda = (l, 1 - l) that weighs them. Actor and critics know the preference. The critics learn
-both returns, for all preferences at once, so that a preference is chosen when the policy is used and not before.
+both returns, for all preferences at once.
 
 Projection is only the way out after many rejections, and of the deterministic policy in evaluations.
 """

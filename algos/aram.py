@@ -51,7 +51,7 @@ class ARAMConfig(Config):
     preferences: int = setting(4, "ARAM: preferences that the actor's step compares", AT_LEAST_ONE)
     snapshots: int = setting(4, "ARAM: earlier critics that it compares as well", AT_LEAST_ONE)
     snapshot_every: int = setting(1_000, "ARAM: gradient steps between these critics", AT_LEAST_ONE)
-    snapshots_after: int = setting(20_000, "ARAM: gradient steps before the first one", NOT_NEGATIVE)
+    snapshots_after: int = setting(20_000, "ARAM: gradient steps without one", NOT_NEGATIVE)
     eval_preference: float = setting(0.9, "ARAM: weight of the task's reward in evaluations", SHARE)
 
 

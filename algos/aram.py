@@ -138,6 +138,12 @@ class ARAM(Agent):
         names = "preference", "rejections", "rejected", "steps", "missing", "copies", "measures", "entropy"
         return {name: getattr(self, name) for name in names} | self.last_losses
 
+    @torch.no_grad()
+    def clear(self, i: int) -> None:
+        """Forget the rejected actions as well: those of a diverged seed may be NaN."""
+        super().clear(i)
+        self.rejected[i] = 0
+
     # ---------------------------------------------------------------- acting
 
     def start_episode(self, which: Sequence[int]) -> None:

@@ -205,6 +205,20 @@ def test_rejected_actions_stand_in_the_last_places_of_a_batch():
                 assert torch.equal(getattr(mixed, column)[i, :first], getattr(batch, column)[i, :first])
 
 
+def test_a_cleared_seed_forgets_its_rejected_actions_and_computes_no_nan():
+    agent, twin = make_agent(rejected_share=0.4), make_agent(rejected_share=0.4)
+    for one, action in (agent, 0.9), (twin, float("nan")):
+        candidates = torch.full((2, 100, DIM), 0.9)
+        candidates[0] = action
+        one.remember([0, 1], torch.ones(2, OBS), candidates, torch.tensor([30, 30]), torch.zeros(2))
+        one.clear(0)
+        one.update(make_batch())
+    assert agent.rejected[:, 0].tolist() == [0, 30] and not twin.diverged()
+    for name, losses in agent.losses.items():
+        assert torch.equal(losses, twin.losses[name])
+    assert torch.equal(agent.with_rejections(make_batch()).action[0], make_batch().action[0])
+
+
 def test_every_kept_rejection_can_be_drawn_and_no_other_row():
     agent, batch = make_agent(rejected_share=1.0), make_batch()
     candidates = torch.arange(1.0, 8.0).view(1, 7, 1).expand(2, 7, DIM)

@@ -114,6 +114,7 @@ class ARAM(Agent):
         # The last rejected actions of each seed, with their observations: a ring.
         self.rejections = zeros(config.rejected_kept, self.obs_dim + self.action_dim)
         self.rejected, self.steps = (zeros(1, dtype=torch.int64) for _ in range(2))  # actions and steps so far
+        self.measured = torch.zeros(seeds, dtype=torch.int64)  # the steps on the CPU: acting need not wait for a GPU
         self.missing = zeros(config.snapshots) + torch.inf  # for each earlier critic 0, or inf where there is none yet
         self.copies = torch.zeros(seeds, dtype=torch.int64)  # of the critic, so far
         # Means over steps: rejected draws, share of steps that project, share of the draws that are feasible.
@@ -135,7 +136,7 @@ class ARAM(Agent):
         return optimizers | ({"temperature": self.temperature_optimizer} if self.config.learn_temperature else {})
 
     def memory(self) -> dict[str, Tensor]:
-        names = "preference", "rejections", "rejected", "steps", "missing", "copies", "measures", "entropy"
+        names = "preference", "rejections", "rejected", "steps", "measured", "missing", "copies", "measures", "entropy"
         return {name: getattr(self, name) for name in names} | self.last_losses
 
     @torch.no_grad()
@@ -207,7 +208,8 @@ class ARAM(Agent):
             self.rejected += count.to(self.device)
         self.steps += stepped.unsqueeze(-1).to(self.device)
         now = torch.cat([count, count == draws, feasible.unsqueeze(-1)], dim=-1)
-        weight = stepped / self.steps.cpu()[:, 0].clamp(min=1, max=MEASURED_STEPS)
+        self.measured += stepped
+        weight = stepped / self.measured.clamp(min=1, max=MEASURED_STEPS)
         self.measures.lerp_(now, weight.unsqueeze(-1))
 
     def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:

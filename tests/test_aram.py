@@ -77,7 +77,8 @@ def test_after_the_last_rejection_the_draw_is_projected_and_stored_as_it_is():
     measures = agent.statistics()
     assert measures["fallbacks"][0] > 0.99 and measures["rejected_draws"][0] == pytest.approx(7, abs=0.01)
     assert measures["acceptance_rate"][0] < 0.01
-    assert agent.steps[:, 0].tolist() == [3001, 1] and agent.rejected[:, 0].tolist() == [7 * 3001, 7]
+    assert agent.steps[:, 0].tolist() == agent.measured.tolist() == [3001, 1]
+    assert agent.rejected[:, 0].tolist() == [7 * 3001, 7]
 
 
 def test_each_step_counts_alike_in_the_acceptance_rate():

@@ -26,8 +26,6 @@ from core.maps import Project, Sample
 from core.networks import MLP, Adam, Network, frozen_copy, rows_of, soft_update
 from core.replay import Batch
 
-DECAY_STEPS = 10_000
-"""Environment steps after which the share of rejected actions falls by `rejected_share_decay`."""
 MEASURED_STEPS = 1_000
 """About so many of the last environment steps count in the measures of acceptance."""
 
@@ -46,7 +44,8 @@ class ARAMConfig(Config):
     rejection_penalty: float = setting(0.2, "ARAM: cost of a rejected action", NOT_NEGATIVE)
     most_rejections: int = setting(100, "ARAM: rejected draws after which the last one is projected", AT_LEAST_ONE)
     rejected_share: float = setting(0.2, "ARAM: share of rejected actions in a batch", SHARE)
-    rejected_share_decay: float = setting(0.99, "ARAM: factor of that share every 10,000 steps", POSITIVE_SHARE)
+    rejected_share_decay: float = setting(0.99, "ARAM: factor of that share, every so many steps", POSITIVE_SHARE)
+    rejected_share_every: int = setting(10_000, "ARAM: environment steps from one such factor to the next", AT_LEAST_ONE)
     rejected_kept: int = setting(100_000, "ARAM: rejected actions kept, a seed", AT_LEAST_ONE)
     preferences: int = setting(4, "ARAM: preferences that the actor's step compares", AT_LEAST_ONE)
     snapshots: int = setting(4, "ARAM: earlier critics that it compares as well", AT_LEAST_ONE)
@@ -274,7 +273,7 @@ class ARAM(Agent):
         rows = self.rejections.gather(1, chosen.unsqueeze(-1).expand(-1, -1, self.rejections.shape[-1]))
         obs, action = rows.split([self.obs_dim, self.action_dim], dim=-1)
         # The share falls while the shapes stay. No batch has more rejected actions than there are.
-        share = config.rejected_share * config.rejected_share_decay ** (self.steps // DECAY_STEPS)
+        share = config.rejected_share * config.rejected_share_decay ** (self.steps // config.rejected_share_every)
         replace = torch.arange(places, device=kept.device) >= places - (share * size).round().minimum(kept)
 
         def replaced(column: Tensor, by: Tensor | float) -> Tensor:

@@ -3,7 +3,7 @@
 The policy is asked again until it suggests a feasible action. A rejected suggestion is an experience too: it leads from
 a state back to the same state at the cost of a penalty. So there are two rewards, that of the task and minus the
 penalty, and a preference lambda = (l, 1 - l) that weighs them. Actor and critics know the preference. The critics learn
-both returns, for all preferences at once, so that a preference is chosen when the policy is used and not before.
+both returns, for all preferences at once.
 
 Projection is only the way out after many rejections, and of the deterministic policy in evaluations.
 """
@@ -26,8 +26,6 @@ from core.maps import Project, Sample
 from core.networks import MLP, Adam, Network, frozen_copy, rows_of, soft_update
 from core.replay import Batch
 
-DECAY_STEPS = 10_000
-"""Environment steps after which the share of rejected actions falls by `rejected_share_decay`."""
 MEASURED_STEPS = 1_000
 """About so many of the last environment steps count in the measures of acceptance."""
 
@@ -37,7 +35,7 @@ class ARAMConfig(Config):
     """ARAM's own settings. The defaults are the constants of its published code, but for docs/deviations.md.
 
     A rejection costs, beside its penalty, the delay of all later rewards: (1 - gamma) times their value. Where that is
-    not positive, waiting pays, and the policy does not learn to be feasible. So `reward_shift` makes rewards larger.
+    not positive, the delay is a gain and works against the penalty. So `reward_shift` can make rewards larger.
     """
 
     temperature: float = setting(0.2, "ARAM: weight of the entropy at the start", POSITIVE)
@@ -46,12 +44,13 @@ class ARAMConfig(Config):
     rejection_penalty: float = setting(0.2, "ARAM: cost of a rejected action", NOT_NEGATIVE)
     most_rejections: int = setting(100, "ARAM: rejected draws after which the last one is projected", AT_LEAST_ONE)
     rejected_share: float = setting(0.2, "ARAM: share of rejected actions in a batch", SHARE)
-    rejected_share_decay: float = setting(0.99, "ARAM: factor of that share every 10,000 steps", POSITIVE_SHARE)
+    rejected_share_decay: float = setting(0.99, "ARAM: factor of that share, every so many steps", POSITIVE_SHARE)
+    rejected_share_every: int = setting(10_000, "ARAM: environment steps from factor to factor", AT_LEAST_ONE)
     rejected_kept: int = setting(100_000, "ARAM: rejected actions kept, a seed", AT_LEAST_ONE)
     preferences: int = setting(4, "ARAM: preferences that the actor's step compares", AT_LEAST_ONE)
     snapshots: int = setting(4, "ARAM: earlier critics that it compares as well", AT_LEAST_ONE)
     snapshot_every: int = setting(1_000, "ARAM: gradient steps between these critics", AT_LEAST_ONE)
-    snapshots_after: int = setting(20_000, "ARAM: gradient steps before the first one", NOT_NEGATIVE)
+    snapshots_after: int = setting(20_000, "ARAM: gradient steps without one", NOT_NEGATIVE)
     eval_preference: float = setting(0.9, "ARAM: weight of the task's reward in evaluations", SHARE)
 
 
@@ -97,7 +96,7 @@ class ARAM(Agent):
         self.actor = GaussianActor(self.obs_dim + 2, self.action_dim, config.hidden, init).to(self.device)
         self.critic = VectorCritic(*sizes, init).to(self.device)
         self.critic_target = frozen_copy(self.critic)
-        self.earlier = frozen_copy(VectorCritic(*sizes, init, 2 * config.snapshots)).to(self.device)
+        self.earlier = VectorCritic(*sizes, init, 2 * config.snapshots).to(self.device).requires_grad_(False)
         self.temperature = Temperature(seeds).to(self.device)
         self.temperature.log_alpha.data.fill_(config.temperature).log_()
         self.temperature.requires_grad_(config.learn_temperature)
@@ -114,9 +113,11 @@ class ARAM(Agent):
         # The last rejected actions of each seed, with their observations: a ring.
         self.rejections = zeros(config.rejected_kept, self.obs_dim + self.action_dim)
         self.rejected, self.steps = (zeros(1, dtype=torch.int64) for _ in range(2))  # actions and steps so far
+        self.measured = torch.zeros(seeds, dtype=torch.int64)  # the steps on the CPU: acting need not wait for a GPU
         self.missing = zeros(config.snapshots) + torch.inf  # for each earlier critic 0, or inf where there is none yet
         self.copies = torch.zeros(seeds, dtype=torch.int64)  # of the critic, so far
-        self.measures = torch.zeros(seeds, 2)  # means: rejected draws a step, share of steps that project
+        # Means over steps: rejected draws, share of steps that project, share of the draws that are feasible.
+        self.measures = torch.zeros(seeds, 3)
         self.entropy = zeros(1)  # of the policy at the last batch's states
         self.last_losses = {name: zeros() for name in ("critic_loss", "actor_loss")}
 
@@ -134,8 +135,14 @@ class ARAM(Agent):
         return optimizers | ({"temperature": self.temperature_optimizer} if self.config.learn_temperature else {})
 
     def memory(self) -> dict[str, Tensor]:
-        names = "preference", "rejections", "rejected", "steps", "missing", "copies", "measures", "entropy"
+        names = "preference", "rejections", "rejected", "steps", "measured", "missing", "copies", "measures", "entropy"
         return {name: getattr(self, name) for name in names} | self.last_losses
+
+    @torch.no_grad()
+    def clear(self, i: int) -> None:
+        """Forget the rejected actions as well: those of a diverged seed may be NaN."""
+        super().clear(i)
+        self.rejected[i] = 0
 
     # ---------------------------------------------------------------- acting
 
@@ -149,7 +156,7 @@ class ARAM(Agent):
     def act(self, obs: Tensor, center: Tensor | None, warming_up: Sequence[int], exploring: Sequence[int]) -> Action:
         """Draw until an action is feasible; after `most_rejections` rejected draws, project the last one.
 
-        All draws of all seeds are made and checked at once, and those after the first feasible one are dropped.
+        All draws of all seeds are made and checked at once. Those after the first feasible one only count in a measure.
         """
         seeds, draws = len(self.seeds), self.config.most_rejections
         candidates = torch.zeros(seeds, draws, self.action_dim)
@@ -165,7 +172,7 @@ class ARAM(Agent):
         executed = suggested
         if exhausted.any():
             executed = torch.where(exhausted.unsqueeze(-1), self.feasible(obs, suggested, None), suggested)
-        self.remember([*warming_up, *exploring], obs, candidates, rejected)
+        self.remember([*warming_up, *exploring], obs, candidates, rejected, feasible.float().mean(-1))
         return Action(suggested, executed, suggested)
 
     def draw(self, obs: Tensor, which: Sequence[int]) -> Tensor:
@@ -179,10 +186,13 @@ class ARAM(Agent):
     def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
         return self.draw(obs, which)[:, 0]
 
-    def remember(self, which: Sequence[int], obs: Tensor, candidates: Tensor, rejected: Tensor) -> None:
+    def remember(
+        self, which: Sequence[int], obs: Tensor, candidates: Tensor, rejected: Tensor, feasible: Tensor
+    ) -> None:
         """Count a step of the seeds `which` and keep their rejected actions, the first ones of `candidates`.
 
-        obs (seeds, n), candidates (seeds, draws, d) and how many are rejected (seeds,) are on the CPU.
+        obs (seeds, n), candidates (seeds, draws, d), how many are rejected (seeds,) and which share of all candidates
+        is feasible (seeds,) are on the CPU.
         """
         kept, draws = self.config.rejected_kept, candidates.shape[1]
         stepped = torch.zeros(len(self.seeds), dtype=torch.int64)
@@ -196,8 +206,9 @@ class ARAM(Agent):
             self.rejections[seeds, (self.rejected[seeds, 0] + numbers) % kept] = rows
             self.rejected += count.to(self.device)
         self.steps += stepped.unsqueeze(-1).to(self.device)
-        now = torch.cat([count, count == draws], dim=-1).float()
-        weight = stepped / self.steps.cpu()[:, 0].clamp(min=1, max=MEASURED_STEPS)
+        now = torch.cat([count, count == draws, feasible.unsqueeze(-1)], dim=-1)
+        self.measured += stepped
+        weight = stepped / self.measured.clamp(min=1, max=MEASURED_STEPS)
         self.measures.lerp_(now, weight.unsqueeze(-1))
 
     def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:
@@ -262,7 +273,7 @@ class ARAM(Agent):
         rows = self.rejections.gather(1, chosen.unsqueeze(-1).expand(-1, -1, self.rejections.shape[-1]))
         obs, action = rows.split([self.obs_dim, self.action_dim], dim=-1)
         # The share falls while the shapes stay. No batch has more rejected actions than there are.
-        share = config.rejected_share * config.rejected_share_decay ** (self.steps // DECAY_STEPS)
+        share = config.rejected_share * config.rejected_share_decay ** (self.steps // config.rejected_share_every)
         replace = torch.arange(places, device=kept.device) >= places - (share * size).round().minimum(kept)
 
         def replaced(column: Tensor, by: Tensor | float) -> Tensor:
@@ -314,12 +325,15 @@ class ARAM(Agent):
             self.copies[i] += 1
 
     def statistics(self) -> dict[str, Tensor]:
-        """Measures of the last thousand steps or so: the share of draws that were feasible, rejected draws a step, and
-        the share of steps that projected as all draws were rejected. The others are of the last gradient step."""
-        rejected, fallbacks = self.measures.unbind(-1)
-        accepted = 1.0 - fallbacks
+        """Measures of the last thousand steps or so: the share of a step's draws that are feasible, rejected draws a
+        step, and the share of steps that project as all draws are rejected. The others are of the last gradient step.
+
+        The first one weighs each step alike. Accepted draws over all draws until then would not: a few states where
+        nearly no draw is feasible have most of the draws.
+        """
+        rejected, fallbacks, acceptance = self.measures.unbind(-1)
         return {
-            "acceptance_rate": accepted / (rejected + accepted),
+            "acceptance_rate": acceptance,
             "rejected_draws": rejected,
             "fallbacks": fallbacks,
             "temperature": self.temperature.log_alpha.detach().exp()[:, 0],

@@ -96,7 +96,8 @@ def memory(config: Config, seeds: int) -> float:
     robot = _robot(config)
     centers = 2 if ALGORITHMS[config.algo].map.replays_center(TASKS[config.env].constraint) else 0
     width = 2 * robot.obs_dim + (1 + centers) * robot.action_dim + 2
-    return PROCESS_BYTES + seeds * (SEED_BYTES + 4.0 * width * min(config.buffer_size, config.steps))
+    rejections = getattr(config, "rejected_kept", 0) * (robot.obs_dim + robot.action_dim)  # ARAM's second buffer
+    return PROCESS_BYTES + seeds * (SEED_BYTES + 4.0 * (width * min(config.buffer_size, config.steps) + rejections))
 
 
 def _robot(config: Config) -> Any:

@@ -8,7 +8,7 @@ from helpers import run_command
 
 from algos import ALGORITHMS
 from algos.aram import preferences
-from constraints import Ball, Box
+from constraints import Ball, Box, LinearConstraint
 from core.random import Streams
 from core.replay import Batch
 
@@ -77,7 +77,22 @@ def test_after_the_last_rejection_the_draw_is_projected_and_stored_as_it_is():
     measures = agent.statistics()
     assert measures["fallbacks"][0] > 0.99 and measures["rejected_draws"][0] == pytest.approx(7, abs=0.01)
     assert measures["acceptance_rate"][0] < 0.01
-    assert agent.steps[:, 0].tolist() == [3001, 1] and agent.rejected[:, 0].tolist() == [7 * 3001, 7]
+    assert agent.steps[:, 0].tolist() == agent.measured.tolist() == [3001, 1]
+    assert agent.rejected[:, 0].tolist() == [7 * 3001, 7]
+
+
+def test_each_step_counts_alike_in_the_acceptance_rate():
+    """Every second step, one draw of a hundred is feasible on average; at the others all are."""
+    constraint = LinearConstraint(
+        DIM, lambda obs: torch.eye(DIM).expand(*obs.shape[:-1], DIM, DIM), lambda obs: 2.0 * obs[..., :DIM] - 0.8
+    )
+    agent = make_agent(constraint)
+    for step in range(1_000):
+        agent.act(torch.full((2, OBS), float(step % 2)), None, [0, 1], [])
+    measures = agent.statistics()
+    expected = torch.full((2,), (1.0 + 0.1**2) / 2)  # a uniform number is below -0.8 with probability 0.1
+    torch.testing.assert_close(measures["acceptance_rate"], expected, rtol=0, atol=2e-3)
+    assert (measures["rejected_draws"] > 25).all() and (measures["fallbacks"] > 0.1).all()
 
 
 def test_a_seed_acts_alone_as_among_others():
@@ -174,12 +189,12 @@ def test_a_gradient_step_follows_the_formulas():
 
 
 def test_rejected_actions_stand_in_the_last_places_of_a_batch():
-    agent, batch = make_agent(rejected_share=0.4, rejected_share_decay=0.5), make_batch()
+    agent, batch = make_agent(rejected_share=0.4, rejected_share_decay=0.5, rejected_share_every=500), make_batch()
     assert torch.equal(agent.with_rejections(batch).obs, batch.obs)  # there are none yet
     obs = torch.tensor([5.0, 6.0]).unsqueeze(-1).expand(2, OBS)
-    agent.remember([0, 1], obs, torch.full((2, 100, DIM), 0.9), torch.tensor([3, 6]))
+    agent.remember([0, 1], obs, torch.full((2, 100, DIM), 0.9), torch.tensor([3, 6]), torch.zeros(2))
     assert agent.rejected[:, 0].tolist() == [3, 6]
-    for steps, places in (0, (3, 4)), (9_999, (3, 4)), (10_000, (2, 2)), (20_000, (1, 1)):  # three are no four
+    for steps, places in (0, (3, 4)), (499, (3, 4)), (500, (2, 2)), (1_000, (1, 1)):  # three are no four
         agent.steps.fill_(steps)
         mixed = agent.with_rejections(batch)
         for i, count in enumerate(places):
@@ -191,10 +206,24 @@ def test_rejected_actions_stand_in_the_last_places_of_a_batch():
                 assert torch.equal(getattr(mixed, column)[i, :first], getattr(batch, column)[i, :first])
 
 
+def test_a_cleared_seed_forgets_its_rejected_actions_and_computes_no_nan():
+    agent, twin = make_agent(rejected_share=0.4), make_agent(rejected_share=0.4)
+    for one, action in (agent, 0.9), (twin, float("nan")):
+        candidates = torch.full((2, 100, DIM), 0.9)
+        candidates[0] = action
+        one.remember([0, 1], torch.ones(2, OBS), candidates, torch.tensor([30, 30]), torch.zeros(2))
+        one.clear(0)
+        one.update(make_batch())
+    assert agent.rejected[:, 0].tolist() == [0, 30] and not twin.diverged()
+    for name, losses in agent.losses.items():
+        assert torch.equal(losses, twin.losses[name])
+    assert torch.equal(agent.with_rejections(make_batch()).action[0], make_batch().action[0])
+
+
 def test_every_kept_rejection_can_be_drawn_and_no_other_row():
     agent, batch = make_agent(rejected_share=1.0), make_batch()
     candidates = torch.arange(1.0, 8.0).view(1, 7, 1).expand(2, 7, DIM)
-    agent.remember([0, 1], torch.ones(2, OBS), candidates, torch.tensor([7, 0]))
+    agent.remember([0, 1], torch.ones(2, OBS), candidates, torch.tensor([7, 0]), torch.zeros(2))
     agent.update_noise.uniform = lambda count: torch.linspace(-1.0, 1.0, count).expand(2, count)  # both ends
     seen = agent.with_rejections(batch).action[0, BATCH - 7 :, 0].tolist()
     assert {1.0, 7.0} <= {*seen, 1.0} and max(seen) == 7.0 and min(seen) > 0.0
@@ -205,7 +234,7 @@ def test_the_reward_shift_is_for_steps_of_the_environment_alone():
     shifted, plain = (make_agent(reward_shift=shift) for shift in (0.5, 0.0))
     batch = make_batch()
     for agent in (shifted, plain):
-        agent.remember([0, 1], torch.ones(2, OBS), torch.full((2, 100, DIM), 0.9), torch.tensor([5, 5]))
+        agent.remember([0, 1], torch.ones(2, OBS), torch.full((2, 100, DIM), 0.9), torch.tensor([5, 5]), torch.zeros(2))
     shifted.update(batch)
     plain.update(batch._replace(reward=batch.reward + 0.5))
     assert torch.equal(shifted.losses["critic"], plain.losses["critic"])

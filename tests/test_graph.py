@@ -15,6 +15,7 @@ import core.ahead
 import core.cuda_graph
 import envs
 from algos import ALGORITHMS
+from algos.aram import ARAM
 from constraints import LinearConstraint
 from core.captured import EAGER_CALLS
 from core.cuda_graph import EAGER_STEPS, GradientSteps
@@ -32,7 +33,8 @@ needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a C
 
 def make(name, task="W+M", device="cpu"):
     """An agent with small networks and a replay buffer with random transitions that keeps growing."""
-    config = config_of([f"algo={name}", f"env={task}", "hidden=[16,16]", f"batch_size={BATCH}"])
+    words = ["snapshots_after=1", "snapshot_every=2"] if name == "ARAM" else []
+    config = config_of([f"algo={name}", f"env={task}", "hidden=[16,16]", f"batch_size={BATCH}", *words])
     constraint, robot = envs.constraint(task), envs.TASKS[task].robot
     agent = ALGORITHMS[name].build(replace(config, device=device), constraint, robot.obs_dim, SEEDS)
     agent.map.use_untrained(constraint, torch.zeros(1, robot.obs_dim))
@@ -48,7 +50,7 @@ def make(name, task="W+M", device="cpu"):
             centers = agent.centers(obs), agent.centers(next_obs)
             replay.add([0, 1], Batch(obs, action, reward, terminated, next_obs, *centers))
             if name == "ARAM" and device != "meta":  # it has a second buffer
-                agent.remember([0, 1], obs, uniform.unsqueeze(1), torch.tensor([1, 1]))
+                agent.remember([0, 1], obs, uniform.unsqueeze(1), torch.tensor([1, 1]), torch.zeros(2))
 
     grow(20)
     return agent, replay, grow
@@ -58,9 +60,17 @@ def train(agent, replay, grow):
     """Gradient steps while the buffer grows and wraps."""
     step = GradientSteps(agent, replay, BATCH)
     for _ in range(STEPS):
+        agent.start_rollout([0, 1])
         step()
         grow(5)
+    check_copies(agent)
     return step
+
+
+def check_copies(agent):
+    """Most of ARAM's copies of the critic are made after a graph has been captured."""
+    if isinstance(agent, ARAM):
+        assert agent.copies.tolist() == [5, 5] and not agent.missing.any()
 
 
 def outcome(agent):
@@ -223,12 +233,14 @@ def test_cuda_learns_what_the_cpu_learns_and_never_waits(name, task, monkeypatch
     train(*here)
     steps = GradientSteps(there[0], there[1], BATCH)
     for number in range(STEPS):
+        there[0].start_rollout([0, 1])
         torch.cuda.set_sync_debug_mode("error" if number >= (EAGER_STEPS + 1) * there[0].cycle else "default")
         try:
             steps()
         finally:
             torch.cuda.set_sync_debug_mode("default")
         there[2](5)
+    check_copies(there[0])
     assert len(steps.captured) == there[0].cycle
     for one, other in zip(outcome(here[0]), outcome(there[0]), strict=True):
         for key, value in one["parameters"].items():
@@ -240,6 +252,8 @@ def test_cuda_learns_what_the_cpu_learns_and_never_waits(name, task, monkeypatch
 def test_a_run_on_a_gpu_is_interrupted_and_resumed_with_the_same_bits(name, tmp_path):
     words = f"algo={name} env=W+M seed=0,1 steps=300 learning_starts=100 train_freq=20 gradient_steps=20 device=cuda"
     words += " hidden=[16,16] batch_size=16 eval_every=100 eval_episodes=1 final_episodes=1"
+    if name == "ARAM":
+        words += " snapshots_after=20 snapshot_every=30"
 
     def train(folder, check=lambda: None):
         (cell,) = cells_of([*words.split(), f"results={folder}"])

@@ -18,9 +18,13 @@ class RecordingReplay(Replay):
         return batch
 
 
+# Early copies of the critic, so that they take turns several times.
+OWN_SETTINGS = {"ARAM": {"snapshots_after": 50, "snapshot_every": 30}}
+
+
 def configuration(algo, env, seed, **settings):
     settings = {"steps": 600, "learning_starts": 300, "batch_size": 16, "eval_every": 300} | settings
-    settings |= {"eval_episodes": 1, "final_episodes": 1, "hidden": "[32,32]"}
+    settings |= {"eval_episodes": 1, "final_episodes": 1, "hidden": "[32,32]"} | OWN_SETTINGS.get(algo, {})
     return config_of([f"algo={algo}", f"env={env}", f"seed={seed}", *(f"{k}={v}" for k, v in settings.items())])
 
 
@@ -34,6 +38,8 @@ def train(tmp_path, algo, env, seed, **settings):
     trainer.replay.__class__ = RecordingReplay
     trainer.replay.shown = []
     results = trainer.run()
+    if algo == "ARAM":
+        assert (trainer.agent.copies > config.snapshots).all() and not trainer.agent.missing.any()
     rows = trainer.replay.rows.view(len(seeds), trainer.replay.capacity, -1)
     return {
         s: {

@@ -177,6 +177,9 @@ def test_estimates_grow_with_what_there_is_to_do(tmp_path):
     per_seed = (ten - one) / 9
     assert 1e6 * 4 * (2 * 17 + 3 * 6 + 2) <= per_seed <= 1e6 * 4 * (2 * 17 + 3 * 6 + 2) + 50e6
     assert entry("algo=DPre seed=0 buffer_size=10").memory < one
+    # ARAM's second buffer has 17 + 6 numbers a row.
+    larger, smaller = (entry(f"algo=ARAM seed=0 rejected_kept={kept}").memory for kept in (100_000, 1))
+    assert larger - smaller == pytest.approx(4 * 23 * 99_999)
     assert {row for row in estimates._rates()} == {(c.task, c.config.algo) for c in cells_of(["algo=paper", "env=all"])}
 
 

@@ -33,6 +33,8 @@ def make_agent(name, gsde=False, constraint=CONSTRAINT, seeds=SEEDS, **settings)
         settings = {"penalty": 1.5} | settings
     if name == "NFW":
         settings = {"fw_learning_rate": 0.3} | settings
+    if name == "SFlow":
+        settings = {"flow_entropy": "action" if gsde else "latent"} | settings
     agent = algorithm.build(replace(paper, **settings), constraint, OBS, list(seeds))
     agent.map.use_untrained(constraint, torch.zeros(1, OBS))
     state = agent.map.state()
@@ -149,7 +151,8 @@ def sampled(agent, actor, i, obs, center, noise):
         ratio = u.abs().amax(-1) / CONSTRAINT.gauge(obs, u, center)
         return u, CONSTRAINT.gauge_map(obs, u, center), after_tanh - DIM * ratio.log()
     if map_of(agent) == "flow":
-        return raw.tanh(), mapped(agent, obs, raw.tanh()), after_tanh - decoded(agent, obs, raw.tanh())[1]
+        log_det = decoded(agent, obs, raw.tanh())[1] if agent.config.flow_entropy == "action" else 0.0
+        return raw.tanh(), mapped(agent, obs, raw.tanh()), after_tanh - log_det
     if map_of(agent) == "alpha_map":
         return (
             raw,

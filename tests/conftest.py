@@ -12,6 +12,7 @@ from hypothesis import settings
 
 from algos import ALGORITHMS, Algorithm
 from core import flow_training
+from plots import aggregates, figures
 from sweep import flows
 
 settings.register_profile("ci", max_examples=40, deadline=None)
@@ -45,3 +46,12 @@ def small_flows(monkeypatch):
     for algorithm in (ALGORITHMS["DFlow"], ALGORITHMS["SFlow"]):
         monkeypatch.setitem(vars(algorithm.map), "flow_steps", 20)
         monkeypatch.setitem(vars(algorithm), "config_class", Algorithm.config_class.func(algorithm))  # it is cached
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that plot.py would save, by name."""
+    found = {}
+    for module in (figures, aggregates):
+        monkeypatch.setattr(module, "save", lambda figure, folder, name, formats: found.setdefault(name, figure) and [])
+    return found

@@ -7,7 +7,6 @@ import pytest
 from helpers import refused_by_plot, write_run
 
 import plot
-from plots import aggregates, figures
 from plots.others import COLUMNS, parse_sources, read_csv
 from plots.paper import labelled, order_algos, read_paper, same_without_constraint, unlabelled
 
@@ -20,15 +19,6 @@ R+L2,SRad,1,10000,9.5
 R+L2,FISOR,0,10000,11.0
 Arm,FISOR,0,10000,2.0
 """
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that plot.py would save, by name."""
-    found = {}
-    for module in (figures, aggregates):
-        monkeypatch.setattr(module, "save", lambda figure, folder, name, formats: found.setdefault(name, figure) and [])
-    return found
 
 
 @pytest.fixture

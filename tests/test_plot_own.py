@@ -3,25 +3,15 @@
 import csv
 import math
 
-import pytest
 from helpers import refused_by_plot, write_run
 
 import plot
 from algos import ALGORITHMS, PAPER
-from plots import aggregates, figures, style
+from plots import style
 from plots.grouping import group_runs
 from plots.paper import COLORS, LATER, first_beyond, order_algos
 from plots.rewards import comparison_table, reward_table
 from store.folder import read_results
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that plot.py would save, by name."""
-    found = {}
-    for module in (figures, aggregates):
-        monkeypatch.setattr(module, "save", lambda figure, folder, name, formats: found.setdefault(name, figure) and [])
-    return found
 
 
 def records(root, table):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
 import re
 import shlex
@@ -22,7 +23,7 @@ _PACKAGES = ("numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omegaconf")
 
 
 def describe_environment(command: Sequence[str]) -> dict[str, Any]:
-    """The content of `info.json`: versions, git commit, command, start time, and the user's sources that are loaded.
+    """The content of `info.json`: versions, git commit, command, machine, start time, and the user's loaded sources.
 
     It names no path of this machine.
     """
@@ -42,6 +43,7 @@ def describe_environment(command: Sequence[str]) -> dict[str, Any]:
         "sources": _describe_sources(user_files()),
         "platform": platform.platform(),
         "processor": processor(),
+        "preloaded": _preloaded_libraries(),
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
 
@@ -53,6 +55,11 @@ def processor() -> str:
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()
+
+
+def _preloaded_libraries() -> list[str]:
+    """The names of the libraries in LD_PRELOAD, which may change the arithmetic too (docs/speed.md)."""
+    return [Path(file).name for file in re.split("[ :]+", os.environ.get("LD_PRELOAD", "")) if file]
 
 
 def command_line(words: Sequence[str]) -> str:

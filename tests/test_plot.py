@@ -197,8 +197,12 @@ def test_corrupt_files_are_named_and_their_runs_skipped(tmp_path, capsys, name, 
 
 def test_description_of_the_environment(monkeypatch):
     command = ["/home/someone/repository/run.py", "algo=SRad", "results=/data/runs", "seed=0-9"]
+    monkeypatch.delenv("LD_PRELOAD", raising=False)
+    assert provenance.describe_environment(command)["preloaded"] == []
+    monkeypatch.setenv("LD_PRELOAD", "/home/someone/libfirst.so:second.so third.so")
     info = provenance.describe_environment(command)
     assert info["command"] == "run.py algo=SRad results=runs seed=0-9"
+    assert info["preloaded"] == ["libfirst.so", "second.so", "third.so"]
     assert info["versions"]["torch"] == torch.__version__
     assert info["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", info["started"])

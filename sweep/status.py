@@ -34,10 +34,10 @@ def find_cells(root: Path) -> list[CellFolders]:
 
 
 def describe_status(words: Sequence[str]) -> str:
-    """The table of `run.py status FOLDER`. Raises ConfigError unless it is one folder with cells."""
+    """The table of `run.py status FOLDER`, also of `results=FOLDER`. Raises ConfigError unless it is one with cells."""
     if len(words) != 1:
         raise ConfigError(f"expected one folder of results, as in `run.py status results/`, got {len(words)}")
-    root = Path(words[0]).expanduser()
+    root = Path(words[0].removeprefix("results=")).expanduser()
     if not root.is_dir():
         raise ConfigError(f"{root} is not a folder")
     cells = find_cells(root)

@@ -423,6 +423,8 @@ def test_status_of_a_folder(tmp_path, monkeypatch, capsys):
     assert run_command(["status", str(root)]) == 0
     out = capsys.readouterr().out
     assert "1 queued" in out and "job 7_0" in out and "squeue does not answer" not in out
+    assert run_command(["status", f"results={root}"]) == 0
+    assert capsys.readouterr().out == out
 
 
 @pytest.mark.parametrize("words", [["status"], ["status", "a", "b"], ["status", "nowhere"], ["status", "."]])

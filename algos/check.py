@@ -30,8 +30,8 @@ from core.seed import Seed
 from core.snapshot import parameters_of
 from core.trainer import Trainer
 from store.checkpoint import CheckpointFolder
-from store.folder import RunWriter
 from store.interrupt import Interrupted
+from store.writer import RunWriter
 
 SEEDS = (3, 5, 8)
 OBS, DIM = 4, 2

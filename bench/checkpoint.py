@@ -27,7 +27,7 @@ from core.config import Config, saved_settings
 from core.seed import Best
 from core.words import ConfigError, parse_words, whole_numbers
 from store.checkpoint import CheckpointFolder
-from store.folder import RunWriter
+from store.writer import RunWriter
 from sweep.cells import make_cells
 from sweep.train import make_trainer
 

@@ -29,7 +29,7 @@ import algos.td3
 from bench.common import make_config
 from core.config import Config, saved_settings
 from core.trainer import Trainer
-from store.folder import RunWriter
+from store.writer import RunWriter
 from sweep.train import make_trainer
 
 STEPS, WARM_UP = 10_000, 9_500

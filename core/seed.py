@@ -12,7 +12,8 @@ from torch import Tensor
 from core.config import Config
 from core.suggestions import EVERY, Suggestions
 from store.checkpoint import CheckpointFolder
-from store.folder import RunWriter, has_failed, is_finished
+from store.folder import has_failed, is_finished
+from store.writer import RunWriter
 
 COUNTERS = ("steps", "rollout_steps", "owed", "gradient_steps", "evaluated")
 

@@ -27,8 +27,8 @@ from core.replay import Batch, Replay
 from core.seed import Best, Seed
 from store.checkpoint import Checkpoint
 from store.files import one_line
-from store.folder import RunWriter
 from store.interrupt import Interrupted
+from store.writer import RunWriter
 
 
 class Trainer:

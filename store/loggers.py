@@ -5,7 +5,7 @@
         wandb/           what Weights & Biases keeps, with WANDB_MODE=offline the whole run
         wandb-id.txt     its id of the run; a resumption has the same
 
-The trainer tells a run's numbers to its writer (store/folder.py), and the writer tells the loggers. Nothing comes back.
+The trainer tells a run's numbers to its writer (store/writer.py), and the writer tells the loggers. Nothing comes back.
 A logger that fails is named once and left out, and the training goes on.
 """
 

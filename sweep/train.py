@@ -21,12 +21,13 @@ from core.words import ConfigError, known_name, parse_words
 from envs import TASKS
 from store.checkpoint import Checkpoint, CheckpointFolder, FormatError, group_checkpoints
 from store.definition import Description
-from store.folder import RunWriter, describe_failure, has_ended, has_failed, lockstep_group, read_run
+from store.folder import describe_failure, has_ended, has_failed, lockstep_group, read_run
 from store.interrupt import Interrupted
 from store.lock import run_lock
 from store.loggers import LoggerError, check_loggers, logger_names
 from store.output import forgiving_output
 from store.provenance import command_line, describe_environment
+from store.writer import RunWriter
 from sweep.cells import Cell, make_cells
 from sweep.check import check_training
 from sweep.definition import changed_runs, define, refuse

@@ -10,8 +10,9 @@ import plot
 import run
 from algos import setting_keys
 from core.words import parse_words
-from store.folder import RunWriter, find_runs, read_run, run_folder, variant_name
+from store.folder import find_runs, read_run, run_folder, variant_name
 from store.interrupt import Interrupted
+from store.writer import RunWriter
 from sweep.cells import make_cells
 from sweep.definition import define
 from sweep.train import train as train_cell

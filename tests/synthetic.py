@@ -14,7 +14,8 @@ from tqdm import tqdm
 
 from core.config import saved_settings
 from plots.paper import COLORS, DEFAULT_BATCH, FAMILIES, read_paper
-from store.folder import RunWriter, run_folder, variant_name
+from store.folder import run_folder, variant_name
+from store.writer import RunWriter
 from sweep.cells import paper_config
 
 CONDITIONS = list(dict.fromkeys((task, batch) for task, batch, _ in read_paper()))

@@ -29,6 +29,7 @@ from algos.td3 import TD3
 from core.replay import Batch, Replay
 from store import folder as results
 from store.checkpoint import Checkpoint, CheckpointFolder, group_checkpoints
+from store.writer import RunWriter
 
 ROOT = Path(__file__).parents[1]
 
@@ -243,7 +244,7 @@ def test_every_resumption_is_on_record(tmp_path):
 
 
 def test_tables_go_back_to_what_a_checkpoint_holds(tmp_path):
-    writer = results.RunWriter(tmp_path / "seed=1", {"tau": 0.5}, {"commit": "a"}, eval_episodes=2)
+    writer = RunWriter(tmp_path / "seed=1", {"tau": 0.5}, {"commit": "a"}, eval_episodes=2)
     before = writer.tables()
     assert list(before) == ["evaluations.csv"] and writer.last_finite_evaluation() is None
     writer.append_evaluation(10, [1.0, 3.0], 0.5)
@@ -256,7 +257,7 @@ def test_tables_go_back_to_what_a_checkpoint_holds(tmp_path):
     assert writer.last_finite_evaluation() == {"step": 10, "return_mean": 2.0}
 
     (tmp_path / "seed=1" / "info.json").write_text("{")  # informs people, and nothing rests on it
-    again = results.RunWriter.resume(tmp_path / "seed=1", {"tau": 0.5}, {"commit": "b"}, eval_episodes=2)
+    again = RunWriter.resume(tmp_path / "seed=1", {"tau": 0.5}, {"commit": "b"}, eval_episodes=2)
     again.restore_tables(tables)
     assert again.tables() == tables and results.read_run(again.folder).config == {"tau": 0.5}
     assert json.loads((again.folder / "info.json").read_text()) == {"resumed": [{"commit": "b"}]}

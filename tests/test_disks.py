@@ -6,9 +6,9 @@ import os
 import pytest
 from helpers import CHECKPOINTED, Breaks, assert_identical, break_off, outcome, run_command, train
 
-from store import folder as results
 from store.checkpoint import Checkpoint, CheckpointFolder
 from store.files import replace_file
+from store.writer import RunWriter
 
 
 def no_space(*_):
@@ -126,9 +126,9 @@ def test_a_result_that_cannot_be_written_ends_the_run_with_one_line_and_it_can_b
         path.symlink_to("/dev/full")
         append(writer, name, row)
 
-    append = results.RunWriter._append
+    append = RunWriter._append
     with monkeypatch.context() as patch:
-        patch.setattr(results.RunWriter, "_append", fill_disk)
+        patch.setattr(RunWriter, "_append", fill_disk)
         assert run_command([*CHECKPOINTED.split(), f"results={tmp_path}"]) == 2
     err = capsys.readouterr().err
     (table,) = [path for path in tmp_path.glob("*/*/seed=?/evaluations.csv") if path.is_symlink()]

@@ -5,7 +5,7 @@ import torch
 from helpers import config_of
 
 from core.replay import Replay
-from store.folder import RunWriter
+from store.writer import RunWriter
 from sweep.train import make_trainer
 
 

@@ -22,6 +22,7 @@ import tables
 from plots import figures, grouping, paper, rewards
 from store import folder as results
 from store import provenance
+from store.writer import RunWriter
 
 ROOT = Path(__file__).parents[1]
 STEPS = 20_000
@@ -64,7 +65,7 @@ def test_round_trip(tmp_path):
         "gsde": False,
         "action_noise": None,
     }
-    writer = results.RunWriter(folder, config, {"commit": "abc"}, eval_episodes=2)
+    writer = RunWriter(folder, config, {"commit": "abc"}, eval_episodes=2)
     unfinished = results.read_run(folder)
     assert not unfinished.finished and unfinished.result is None
     assert unfinished.evaluations.returns.shape == (0, 2)
@@ -120,10 +121,10 @@ def test_earlier_runs_are_moved_aside_and_never_lost(tmp_path):
     write_run(tmp_path, "R+N", "SRad", 3, evaluations=3, result=1.0)
     with pytest.raises(FileExistsError, match="finished"):
         write_run(tmp_path, "R+N", "SRad", 3)
-    results.RunWriter(first.folder, {"algo": "SRad"}, {}, 3, replace_finished=True)
+    RunWriter(first.folder, {"algo": "SRad"}, {}, 3, replace_finished=True)
 
     aside = [first.folder.with_name(f"seed=3.old-{i}") for i in (1, 2, 3)]
-    assert [len(results._read_evaluations(old / "evaluations.csv").step) for old in aside] == [1, 2, 3]
+    assert [len(results.read_evaluations(old).step) for old in aside] == [1, 2, 3]
     assert results.is_finished(aside[2]) and not results.is_finished(first.folder)
     assert results.find_runs(tmp_path) == [first.folder]
 

@@ -19,8 +19,9 @@ from core.random import Streams
 from core.seed import COUNTERS
 from core.trainer import Trainer
 from store.checkpoint import CheckpointFolder
-from store.folder import RunWriter, is_finished, read_run
+from store.folder import is_finished, read_run
 from store.interrupt import Interrupted
+from store.writer import RunWriter
 
 OBS, DIM = 3, 2
 LENGTHS = (5, 7)  # of every other episode; the shorter ones terminate, the longer ones are cut off

@@ -25,15 +25,16 @@ _FIRST = 100  # the number of calls that are checked
 _always = False
 
 
-def check_inputs(always: bool = True) -> None:
+def check_inputs(always: bool = True) -> bool:
     """Have the closed forms check coefficients and given centres in every call of this process, not just in the first.
 
     They raise a ConstraintError for values that are NaN, infinite or of the wrong sign or shape, for a matrix that is
     not symmetric and positive semi-definite, and for a centre that is not inside the set. General sets always do. On a
-    GPU, each check waits for the device; in a CUDA graph there can be none.
+    GPU, each check waits for the device; in a CUDA graph there can be none. Returns whether they did so before.
     """
     global _always
-    _always = always
+    before, _always = _always, always
+    return before
 
 
 class FirstCalls:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import Field, dataclass, field, fields, make_dataclass
 from typing import Any, NamedTuple
 
@@ -58,7 +58,8 @@ def setting(default: Any, help: str, rule: Rule | None = None, **metadata: Any) 
     """A field of a dataclass that is a key of the command line.
 
     `help` is one line for the usage text. Metadata: `key` is its name on the command line and in config.yaml, where
-    that is not the field's; `of_density` marks a map's setting that only algorithms with a log-density have.
+    that is not the field's; `of_density` marks a map's setting that only algorithms with a log-density have;
+    `only_with` is a pair of another field and its value without which the setting means nothing.
     """
     metadata |= {"help": help, "rule": rule}
     if isinstance(default, list):
@@ -256,8 +257,18 @@ def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
         if key not in keys_that_apply(base):
             raise ConfigError(f"{key} does not apply to {base.algo} on {base.env}")
         setattr(config, keys_of(config)[key].name, parse_value(type(base), key, text))
+    _check_company(config, overrides)
     _check_ranges(config)
     return config
+
+
+def _check_company(config: Config, overrides: Iterable[str]) -> None:
+    """ConfigError for a setting that means nothing beside the value of another one."""
+    for key, f in keys_of(config).items():
+        if key in overrides and (needed := f.metadata.get("only_with")):
+            other, value = needed
+            if (found := getattr(config, other)) != value:
+                raise ConfigError(f"{key} applies only with {other}={value}, not with {other}={found}")
 
 
 def _check_ranges(config: Config) -> None:

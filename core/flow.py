@@ -92,7 +92,7 @@ class ConditionalFlow(nn.Module):
             scale, shift = coupling(given, features)
             x = self._join(number, given, moved * scale.exp() + shift)
             log_det = log_det + scale.sum(-1)
-        return (self.action_mean + self.action_scale * x).view(*lead, -1), log_det.view(lead)
+        return (self.action_mean + self.action_scale * x).view(*lead, x.shape[-1]), log_det.view(lead)
 
     def encode(self, features: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         lead, action, features = self._prepare(features, action)
@@ -102,7 +102,7 @@ class ConditionalFlow(nn.Module):
             scale, shift = self.couplings[number](given, features)
             x = self._join(number, given, (moved - shift) * (-scale).exp())
             log_det = log_det + scale.sum(-1)
-        return x.view(*lead, -1), log_det.view(lead)
+        return x.view(*lead, x.shape[-1]), log_det.view(lead)
 
     def _prepare(self, features: Tensor, x: Tensor) -> tuple[torch.Size, Tensor, Tensor]:
         """The common leading shape, the points (batch, d) and the standardised features (batch, k)."""
@@ -145,8 +145,12 @@ class Flow(Map):
     flow_steps: int = setting(3_000, "DFlow, SFlow: gradient steps of the flow's training", AT_LEAST_ONE)
     flow_batch_size: int = setting(256, "DFlow, SFlow: samples in such a step", AT_LEAST_ONE)
     flow_learning_rate: float = setting(1e-3, "DFlow, SFlow: Adam's at the start; a cosine takes it to 0", POSITIVE)
-    mle_softness: float = setting(0.02, "DFlow, SFlow: width of the box's edges, for flow=mle", POSITIVE)
-    reverse_softness: float = setting(1e-4, "DFlow, SFlow: width of the set's edges, for flow=reverse", POSITIVE)
+    mle_softness: float = setting(
+        0.02, "DFlow, SFlow: width of the box's edges, for flow=mle", POSITIVE, only_with=("flow", "mle")
+    )
+    reverse_softness: float = setting(
+        1e-4, "DFlow, SFlow: width of the set's edges, for flow=reverse", POSITIVE, only_with=("flow", "reverse")
+    )
 
     flow_entropy: str = setting(
         "latent",

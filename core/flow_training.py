@@ -4,9 +4,10 @@ With x the point of the box, a the action and s the state:
 
 - `mle`, as FlowPG: actions a are uniform in the set, x = encode(a | s), and the loss is log |det da/dx| plus half the
   square of x's distance from the box in units of `mle_softness`: maximum likelihood under a box with soft edges.
-- `reverse`, as CV-Flow: points x are uniform in the box, a = decode(x | s), and the loss is -log |det da/dx| plus the
-  violation of a in units of `reverse_softness`: the Kullback-Leibler divergence to a set with soft edges. Every other
-  point is moved to the box's faces, where policies often are. Without that, most of the faces end up outside.
+- `reverse`, as CV-Flow: points x are uniform in the box, a = decode(x | s), and the loss is -log |det da/dx| plus how
+  far a is outside in units of `reverse_softness`: the Kullback-Leibler divergence to a set with soft edges. "How far
+  outside" is `Constraint.penalty` plus the sum of what exceeds the box. Every other point is moved to the box's faces,
+  where policies often are. Without that, most of the faces end up outside.
 
 States are those of random play, moved towards their mean or away from it (`FURTHEST`).
 """
@@ -20,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from constraints import Constraint, ConstraintError
+from constraints import Constraint, ConstraintError, check_inputs
 from core.flow import Flow
 from core.networks import Adam
 from core.snapshot import parameters_of
@@ -37,6 +38,8 @@ LARGEST_STEP = 0.1
 """Norm of the gradient at most, as published."""
 TRIES = 64
 _CHUNK = 2_000
+_SLOW_CHUNK = 100
+"""States whose actions `Constraint.sample` draws without a look at the user's wish to stop."""
 _FEASIBLE = 1e-6
 
 
@@ -59,9 +62,10 @@ class FlowTraining:
         self.step = 0
         self.obs = self._further_out(obs[:-HELD_OUT], POOL, stop_if_asked)
         self.test_obs = self._further_out(obs[-HELD_OUT:], HELD_OUT, stop_if_asked)
-        self.features = constraint.features(self.obs).float()
+        self.features = torch.cat([constraint.features(chunk).float() for chunk in self.obs.split(_CHUNK)])
         self.actions = self._feasible(self.obs if flow.flow == "mle" else self.obs[:SCALING], stop_if_asked)
         self.test_actions = self._feasible(self.test_obs, stop_if_asked)
+        self.tolerance = constraint.least_violation(self.test_obs) + _FEASIBLE  # of a feasible action
         self.network = flow.new_network(constraint.dim, self.features.shape[-1])
         self.network.standardize(self.features, self.actions)
         self.optimizer = Adam(self.network.parameters(), flow.flow_learning_rate)
@@ -75,18 +79,23 @@ class FlowTraining:
         some = obs[torch.randint(len(obs), (count,), generator=self.generator)]
         mean = obs.mean(0)
         moved = mean + FURTHEST * torch.rand(count, 1, generator=self.generator) * (some - mean)
+        checked_before = check_inputs()
         try:
             for chunk in moved.split(_CHUNK):
                 stop_if_asked()
+                self.constraint.project(chunk, chunk.new_zeros(len(chunk), self.constraint.dim))
                 self.constraint.center(chunk)
         except ConstraintError:  # a set of one's own need not exist where the robot cannot be
             return some
+        finally:
+            check_inputs(checked_before)
         return moved
 
     def _feasible(self, obs: Tensor, stop_if_asked: Callable[[], None]) -> Tensor:
         """An action (n, d) for each of obs (n, k), uniform in its set.
 
         It is the first feasible one of `TRIES` in the box, which takes a small part of the time of `Constraint.sample`.
+        Where the set is empty, it is the projection of one, which violates least.
         """
         actions = []
         for chunk in obs.split(_CHUNK):
@@ -94,9 +103,12 @@ class FlowTraining:
             tries = 2.0 * torch.rand(len(chunk), TRIES, self.constraint.dim, generator=self.generator) - 1.0
             feasible = self.constraint.violation(chunk.unsqueeze(1), tries) <= 0.0
             action = tries[torch.arange(len(chunk)), feasible.int().argmax(1)]
-            left = ~feasible.any(1)
-            if left.any():
-                action[left] = self.constraint.sample(chunk[left], 1, self.generator).squeeze(-2)
+            empty = self.constraint.least_violation(chunk) > 0.0
+            if empty.any():
+                action[empty] = self.constraint.project(chunk[empty], action[empty])
+            for some in (~feasible.any(1) & ~empty).nonzero().squeeze(1).split(_SLOW_CHUNK):
+                stop_if_asked()
+                action[some] = self.constraint.sample(chunk[some], 1, self.generator).squeeze(-2)
             actions.append(action)
         return torch.cat(actions)
 
@@ -106,8 +118,7 @@ class FlowTraining:
 
     def advance(self) -> None:
         """One gradient step. Raises DivergedError."""
-        share = self.step / self.flow.flow_steps
-        self.optimizer.param_groups[0]["lr"] = self.flow.flow_learning_rate * 0.5 * (1 + math.cos(math.pi * share))
+        self.optimizer.param_groups[0]["lr"] = self.learning_rate()
         rows = torch.randint(len(self.obs), (self.flow.flow_batch_size,), generator=self.generator)
         loss = (self._likelihood if self.flow.flow == "mle" else self._divergence)(rows).mean()
         gradients = torch.autograd.grad(loss, self.parameters)
@@ -119,6 +130,18 @@ class FlowTraining:
         self.step += 1
         if not math.isfinite(loss.item()):
             raise DivergedError(f"its loss is {loss.item()} at step {self.step}")
+        if self.ended and not all(parameter.isfinite().all() for parameter in self.parameters):
+            raise DivergedError("a parameter is not finite at the end")
+
+    def learning_rate(self) -> float:
+        """That of the next step: a cosine takes it to 0."""
+        return self.flow.flow_learning_rate * 0.5 * (1 + math.cos(math.pi * self.step / self.flow.flow_steps))
+
+    def points(self, count: int) -> Tensor:
+        """Points (count, d) of the box for the loss `reverse`: every other one is on a face."""
+        x = 2.0 * torch.rand(count, self.constraint.dim, generator=self.generator) - 1.0
+        x[::2] = on_faces(x[::2])
+        return x
 
     def _likelihood(self, rows: Tensor) -> Tensor:
         """The loss `mle` (batch,) at rows of the pool."""
@@ -128,9 +151,7 @@ class FlowTraining:
 
     def _divergence(self, rows: Tensor) -> Tensor:
         """The loss `reverse` (batch,) at rows of the pool."""
-        x = 2.0 * torch.rand(len(rows), self.constraint.dim, generator=self.generator) - 1.0
-        x[::2] = on_faces(x[::2])
-        action, log_det = self.network.decode(self.features[rows], x)
+        action, log_det = self.network.decode(self.features[rows], self.points(len(rows)))
         outside = self.constraint.penalty(self.obs[rows], action) + (action.abs() - 1.0).clamp(min=0.0).sum(-1)
         return outside / self.flow.reverse_softness - log_det
 
@@ -150,8 +171,8 @@ class FlowTraining:
         )
         encoded = self.network.encode(features, self.test_actions)[0]
         return {
-            "accuracy": (violation <= _FEASIBLE).double().mean().item(),
-            "face_accuracy": (on_face <= _FEASIBLE).double().mean().item(),
+            "accuracy": (violation <= self.tolerance).double().mean().item(),
+            "face_accuracy": (on_face <= self.tolerance).double().mean().item(),
             "recall": (encoded.abs().amax(-1) <= 1.0).double().mean().item(),
             "violation": violation.double().clamp(min=0.0).mean().item(),
         }
@@ -180,4 +201,4 @@ class FlowTraining:
 
 def on_faces(x: Tensor) -> Tensor:
     """The points (..., d) of the box's faces that are on the rays from the origin through x."""
-    return x / x.abs().amax(-1, keepdim=True)
+    return x / x.abs().amax(-1, keepdim=True).clamp(min=1e-9)

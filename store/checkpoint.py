@@ -16,7 +16,6 @@ every bit. Any other choice changes the shape of the batch, and thus the roundin
 from __future__ import annotations
 
 import hashlib
-import io
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -27,6 +26,7 @@ from typing import Any, NamedTuple
 import torch
 
 from store.files import one_line, replace_file
+from store.tensors import load_tensors, save_tensors
 
 Stretch = Callable[[int, int], Sequence[torch.Tensor]]
 """Maps `start` and `stop` to views of one seed's transitions `start` to `stop` - 1, a row of float32 each."""
@@ -68,7 +68,7 @@ class Checkpoint:
 
     def state(self) -> dict[str, Any]:
         """The state that `CheckpointFolder.write` was given."""
-        return _load(self.path)["state"]
+        return load_tensors(self.path)["state"]
 
     def fill(self, stretch: Stretch, oldest: int) -> None:
         """Copy the transitions from `oldest` on, the first that the buffer holds, into the views of `stretch`."""
@@ -117,11 +117,7 @@ class CheckpointFolder:
         files = self._write_replay(stretch, oldest, stop)
         content = {"format": FORMAT, "serial": self.serial + 1, "moment": moment, "group": list(group), "step": step}
         content |= {"settings": dict(settings), "replay_files": [list(file) for file in files]}
-        body = io.BytesIO()
-        torch.save(content | {"state": dict(state)}, body)
-        digest = hashlib.sha256(body.getbuffer()).hexdigest().encode() + b"\n"
-        path = self._state_path(self.serial + 1)
-        replace_file(path, lambda file: file.writelines([digest, body.getbuffer()]))
+        save_tensors(self._state_path(self.serial + 1), content | {"state": dict(state)})
         self.written = files
 
     def keep(self) -> None:
@@ -163,7 +159,7 @@ class CheckpointFolder:
         digests: dict[str, str] = {}  # of replay files, most of which both checkpoints name
         for path in sorted(self.folder.glob("state-*.pt"), key=_serial_of, reverse=True):
             try:
-                content = _load(path)
+                content = load_tensors(path)
                 if content.get("format") != FORMAT:
                     raise FormatError(
                         f"{path} was written by another version of this code, and this one cannot resume from it;"
@@ -192,7 +188,7 @@ class CheckpointFolder:
             if _serial_of(path) > self.serial:
                 path.unlink()
         with suppress(*_DAMAGES):
-            before = _load(self._state_path(self.serial - 1))
+            before = load_tensors(self._state_path(self.serial - 1))
             self.previous_files = [ReplayFile(*file) for file in before["replay_files"]]
 
     def remove(self) -> None:
@@ -246,15 +242,6 @@ def group_checkpoints(
 def _serial_of(path: Path) -> int:
     number = path.stem.removeprefix("state-")
     return int(number) if number.isdecimal() else -1
-
-
-def _load(path: Path) -> dict[str, Any]:
-    with open(path, "rb") as file:
-        digest = file.readline(100).rstrip(b"\n").decode("ascii", "replace")
-        body = io.BytesIO(file.read())
-    if hashlib.sha256(body.getbuffer()).hexdigest() != digest:
-        raise ValueError("wrong checksum")
-    return torch.load(body, weights_only=True)
 
 
 def _digest(path: Path) -> str:

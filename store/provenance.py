@@ -28,7 +28,7 @@ def describe_environment(command: Sequence[str]) -> dict[str, Any]:
     It names no path of this machine.
     """
     # PyTorch itself names its build (+cpu, +cu130), which the metadata of a package may leave out.
-    versions: dict[str, str | None] = {"python": platform.python_version(), "torch": torch.__version__}
+    versions: dict[str, str | None] = {"python": platform.python_version(), "torch": str(torch.__version__)}
     for package in _PACKAGES:
         try:
             versions[package] = metadata.version(package)

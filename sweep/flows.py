@@ -4,7 +4,8 @@
         settings.json    what the checksum is of: the settings of the flow and the definition of the task
         training.csv     step, seconds, and the measures of `core.flow_training` at that step
         checkpoint.pt    while the training is unfinished
-        flow.pt          the parameters; written last, so its presence means that the training is finished
+        flow.pt          the parameters, the measures and where they come from; written last, so its presence means that
+                         the training is finished
     results/flows/<task>/<flow>-<checksum>.lock
                          while a process trains it; others wait for it
 
@@ -17,7 +18,8 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
@@ -38,10 +40,12 @@ from store.definition import Description
 from store.files import one_line, replace_file
 from store.interrupt import Interrupted
 from store.lock import LockedError, run_lock
+from store.provenance import describe_environment
+from store.tensors import load_tensors, save_tensors
 
 FOLDER = "flows"
 """The folder of flows in that of results."""
-VERSION = 1
+VERSION = 2
 """Counts the changes of how flows are trained."""
 STATES = 20_000
 """States of random play, of which `core.flow_training.HELD_OUT` are for measures."""
@@ -70,40 +74,40 @@ class FlowFolder:
         self.path = Path(config.results).expanduser() / FOLDER / config.env / f"{flow.flow}-{digest}"
 
     def read(self) -> dict[str, Any] | None:
-        """The trained flow and its measures, None where there is none. ConfigError for a file that is damaged."""
-        return self._load("flow.pt")
+        """The trained flow, None where there is none. ConfigError for a file that is damaged."""
+        return self._load("flow.pt", "delete it, and the next run trains the flow again")
 
     def checkpoint(self) -> dict[str, Any] | None:
         """What the training goes on from, None where it starts anew."""
         try:
-            return self._load("checkpoint.pt")
+            return self._load("checkpoint.pt", "the training of the flow starts again")
         except ConfigError as error:
-            print(f"{error}; the training of the flow starts again", file=sys.stderr)
+            print(error, file=sys.stderr)
             return None
 
-    def _load(self, name: str) -> dict[str, Any] | None:
+    def _load(self, name: str, remedy: str) -> dict[str, Any] | None:
         path = self.path / name
         if not path.is_file():
             return None
         try:
-            return torch.load(path, weights_only=True)
-        except Exception as error:  # PyTorch raises whatever its unpickler and its archive reader do
-            raise ConfigError(f"{path} is damaged: {one_line(error) or type(error).__name__}") from error
+            return load_tensors(path)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path} is damaged ({one_line(error)}); {remedy}") from error
 
     def begin(self) -> None:
         """Make the folder."""
         self.path.mkdir(parents=True, exist_ok=True)
         self._replace("settings.json", self.settings)
 
-    def save(self, name: str, content: Mapping[str, Any]) -> None:
-        replace_file(self.path / f"{name}.pt", lambda file: torch.save(dict(content), file))
-
     def save_curve(self, rows: list[dict[str, float]]) -> None:
         lines = [",".join(rows[0]), *(",".join(map(repr, row.values())) for row in rows)]
         self._replace("training.csv", "\n".join(lines) + "\n")
 
+    def save_checkpoint(self, content: Mapping[str, Any]) -> None:
+        save_tensors(self.path / "checkpoint.pt", content)
+
     def finish(self, content: Mapping[str, Any]) -> None:
-        self.save("flow", content)
+        save_tensors(self.path / "flow.pt", content)
         (self.path / "checkpoint.pt").unlink(missing_ok=True)
 
     def _replace(self, name: str, text: str) -> None:
@@ -115,7 +119,8 @@ def flow_of(
 ) -> dict[str, Any] | None:
     """The flow that the map of `config` needs, from its folder or trained now; None where the map needs none.
 
-    It has the parameters as `state` and the last row of training.csv as `measures`. `stop_if_asked` raises Interrupted
+    It has the parameters as `state`, the last row of training.csv as `measures`, and as `info` what info.json of a run
+    has: versions, commit and machine of the process that trained it. `stop_if_asked` raises Interrupted
     to end the training with a checkpoint. Raises ConfigError where the flow cannot be trained.
     """
     algorithm = ALGORITHMS[config.algo]
@@ -169,10 +174,8 @@ def _train(config: Config, flow: Flow, folder: FlowFolder, stop_if_asked: Callab
 
         def checkpoint() -> None:
             seconds = time.perf_counter() - started
-            try:
-                folder.save("checkpoint", {"training": training.state(), "rows": rows, "seconds": seconds})
-            except OSError as error:
-                tqdm.write(f"no checkpoint of the flow at step {training.step}: {one_line(error)}", file=sys.stderr)
+            with _reported(f"no checkpoint of the flow at step {training.step}"):
+                folder.save_checkpoint({"training": training.state(), "rows": rows, "seconds": seconds})
 
         saved = time.perf_counter()
         try:
@@ -180,10 +183,11 @@ def _train(config: Config, flow: Flow, folder: FlowFolder, stop_if_asked: Callab
                 stop_if_asked()
                 training.advance()
                 bar.update()
-                if training.step % max(flow.flow_steps // MEASURES, 1) == 0 or training.ended:
+                if training.step * MEASURES // flow.flow_steps > (training.step - 1) * MEASURES // flow.flow_steps:
                     seconds = time.perf_counter() - started
                     rows.append({"step": training.step, "seconds": round(seconds, 2), **training.measure()})
-                    folder.save_curve(rows)
+                    with _reported(f"no training.csv of the flow at step {training.step}"):
+                        folder.save_curve(rows)
                     bar.set_postfix(accuracy=f"{rows[-1]['accuracy']:.3f}", refresh=False)
                 if time.perf_counter() - saved > SECONDS:
                     checkpoint()
@@ -195,7 +199,17 @@ def _train(config: Config, flow: Flow, folder: FlowFolder, stop_if_asked: Callab
             raise ConfigError(
                 f"the flow of {config.env} cannot be trained: {error}; try a smaller flow_learning_rate"
             ) from error
-    folder.finish({"state": training.network.state_dict(), "measures": rows[-1]})
+    info = describe_environment(sys.orig_argv[1:])
+    folder.finish({"state": training.network.state_dict(), "measures": rows[-1], "info": info})
+
+
+@contextmanager
+def _reported(what: str) -> Iterator[None]:
+    """Report an OSError and continue."""
+    try:
+        yield
+    except OSError as error:
+        tqdm.write(f"{what}: {one_line(error)}", file=sys.stderr)
 
 
 def random_play(config: Config, stop_if_asked: Callable[[], None]) -> Tensor:

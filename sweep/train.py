@@ -106,7 +106,7 @@ def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Call
             info["lockstep"] = fresh
             flow = flow_of(config, definition, stop_if_asked)
             if flow is not None:
-                info["flow"] = flow["measures"]
+                info["flow"] = flow["measures"] | {"trained": flow["info"]}
             writers = [
                 RunWriter(
                     folders[seed],

@@ -1,12 +1,14 @@
 """The flow of DFlow and SFlow: a bijection with an exact density, its training, and the map that it makes."""
 
+import math
+
 import pytest
 import torch
 
 import envs
 from algos import ALGORITHMS
 from algos.sac import SAC
-from constraints import Ball, Box, Intersection, LinearConstraint, WeightedL1, WeightedPositivePart
+from constraints import Ball, Box, Intersection, LinearConstraint, WeightedL1, WeightedPositivePart, check_inputs
 from core import flow_training
 from core.flow import COUPLINGS, ConditionalFlow, Flow
 from core.flow_training import DivergedError, FlowTraining
@@ -90,6 +92,13 @@ def test_a_flow_without_features_is_the_same_everywhere():
     assert torch.equal(flow.decode(numbers(5, 0), x)[0], flow.decode(numbers(0), x)[0])
 
 
+def test_a_batch_may_be_empty():
+    flow = random_flow(2)
+    for direction in (flow.decode, flow.encode):
+        result, log_det = direction(numbers(0, 2), numbers(0, 2))
+        assert result.shape == (0, 2) and log_det.shape == (0,)
+
+
 # ---------------------------------------------------------------- the map
 
 
@@ -113,7 +122,7 @@ def test_the_map_projects_what_the_flow_leaves_outside():
 
 
 def test_the_density_of_decoded_actions_integrates_to_one():
-    """SFlow's density before the projection, on a grid over all that the flow can reach."""
+    """That of the flow before the projection, on a grid over all that it can reach; the next test has the map's."""
     map, obs = flow_map(), torch.tensor([0.3, -0.2, 0.0])
     flow, features = map._on(torch.device("cpu")).double(), CONSTRAINT.features(obs)
     edge = torch.linspace(-12, 12, 2401, dtype=torch.float64)
@@ -230,6 +239,37 @@ def test_a_short_training_takes_nearly_all_of_the_box_into_the_set(how, constrai
 
 
 @pytest.mark.usefixtures("few_states")
+def test_measures_are_of_states_that_the_training_has_not_seen():
+    held_out = flow_training.HELD_OUT
+    first = states()
+    other_test, other_training = first.clone(), first.clone()
+    other_test[-held_out:] += 7.0
+    other_training[:-held_out] += 7.0
+    flow = Flow(flow_steps=2, flow_width=8)
+    same, seen, unseen = (FlowTraining(flow, CONSTRAINT, obs) for obs in (first, other_test, other_training))
+    assert torch.equal(same.obs, seen.obs) and not torch.equal(same.test_obs, seen.test_obs)
+    assert torch.equal(same.test_obs, unseen.test_obs) and not torch.equal(same.obs, unseen.obs)
+    assert same.test_obs.min() > -3 and seen.test_obs.min() > 3  # they are held-out states, moved from their own mean
+
+
+@pytest.mark.usefixtures("few_states")
+def test_the_learning_rate_falls_along_a_cosine_and_steps_are_cut():
+    training = FlowTraining(Flow("mle", flow_steps=4, flow_width=8, mle_softness=1e-6), CONSTRAINT, states())
+    used = []
+    while not training.ended:
+        training.advance()
+        used.append(training.optimizer.param_groups[0]["lr"])
+        norm = torch.stack([parameter.grad.norm() for parameter in training.parameters]).norm()
+        assert float(norm) == pytest.approx(flow_training.LARGEST_STEP, rel=1e-4)  # so steep is this loss
+    assert used == pytest.approx([1e-3, 0.5e-3 * (1 + 0.5**0.5), 0.5e-3, 0.5e-3 * (1 - 0.5**0.5)])
+
+
+def test_the_origin_has_no_face():
+    points = flow_training.on_faces(torch.tensor([[0.0, 0.0], [0.0, -1e-3], [0.2, -0.1]]))
+    assert points.tolist() == [[0.0, 0.0], [0.0, -1.0], [1.0, -0.5]]
+
+
+@pytest.mark.usefixtures("few_states")
 def test_samples_of_a_training_are_uniform():
     """The first feasible try, or, where all of them fail, `Constraint.sample`."""
     thin = WeightedL1(lambda obs: 0 * obs[..., :2] + torch.tensor([30.0, 1.0]), 0.3, 2)  # |30 a_1| + |a_2| <= 0.3
@@ -277,6 +317,14 @@ def test_a_training_that_diverges_says_where():
 
 
 @pytest.mark.usefixtures("few_states")
+def test_a_last_step_that_ruins_the_parameters_is_no_end(monkeypatch):
+    training = FlowTraining(Flow(flow_steps=1, flow_width=8), CONSTRAINT, states())
+    monkeypatch.setattr(training, "learning_rate", lambda: math.inf)
+    with pytest.raises(DivergedError, match="^a parameter is not finite at the end$"):
+        training.advance()
+
+
+@pytest.mark.usefixtures("few_states")
 def test_states_further_out_are_left_where_the_set_breaks_down_there():
     class Narrow(WeightedL1):
         def _at(self, obs):
@@ -291,3 +339,15 @@ def test_states_further_out_are_left_where_the_set_breaks_down_there():
     training = FlowTraining(Flow(), Narrow(lambda obs: obs[..., :2], 0.2, 2), states())
     assert training.obs.abs().max() <= 0.5
     assert FlowTraining(Flow(), CONSTRAINT, states()).obs.abs().max() > 0.8
+
+
+@pytest.mark.usefixtures("few_states")
+def test_a_closed_form_tells_that_it_breaks_down_there():
+    """Its coefficients are checked however many calls there were, and in the process's own way again afterwards."""
+    ball = Ball(lambda obs: 0.8 - obs.square().sum(-1), 2)  # positive up to the corners of the cube
+    for _ in range(200):
+        ball.features(torch.zeros(1, 3))
+    training = FlowTraining(Flow(), ball, states())
+    assert training.obs.abs().max() <= 0.5 and training.test_obs.abs().max() <= 0.5
+    assert not check_inputs(False)
+    assert FlowTraining(Flow(), Ball(lambda obs: 0.8 + obs.square().sum(-1), 2), states()).obs.abs().max() > 0.8

@@ -13,11 +13,17 @@ from helpers import Breaks, assert_identical, config_of, outcome, run_command, t
 
 import envs
 from algos import ALGORITHMS, load_policy
+from constraints import LinearConstraint
 from core import flow_training
 from core.flow import Flow
+from envs import Task
+from envs.reacher import Reacher
+from store import tensors
+from store.files import replace_file
 from store.folder import find_runs, read_run
 from store.interrupt import Interrupted
 from store.lock import run_lock
+from store.tensors import load_tensors
 from sweep import flows
 from sweep.definition import define
 
@@ -56,8 +62,10 @@ def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path,
     assert_identical(outcome(tmp_path / "whole"), outcome(tmp_path / "broken"))
     one, other = (flow_folders(tmp_path / root)[0] for root in ("whole", "broken"))
     assert one.name == other.name and {path.name for path in other.iterdir()} == {path.name for path in one.iterdir()}
-    first, second = (torch.load(folder / "flow.pt", weights_only=True)["state"] for folder in (one, other))
+    first, second = (load_tensors(folder / "flow.pt")["state"] for folder in (one, other))
     assert all(torch.equal(first[name], second[name]) for name in first)
+    first, second = (np.loadtxt(folder / "training.csv", delimiter=",", skiprows=1) for folder in (one, other))
+    assert np.array_equal(np.delete(first, 1, axis=1), np.delete(second, 1, axis=1))  # but for the seconds
 
 
 def test_a_seed_learns_the_same_alone_and_in_lockstep(tmp_path):
@@ -101,7 +109,18 @@ def test_what_a_training_leaves(tmp_path):
     settings = json.loads((folder / "settings.json").read_text())
     assert settings["flow"]["flow"] == "reverse" and settings["flow"]["flow_steps"] == 20
     for run in find_runs(tmp_path):
-        assert json.loads((run / "info.json").read_text())["flow"]["accuracy"] == rows[-1, 2]
+        info = json.loads((run / "info.json").read_text())
+        assert info["flow"]["accuracy"] == rows[-1, 2]
+        same = ("versions", "commit", "processor", "preloaded")
+        assert [info["flow"]["trained"][key] for key in same] == [info[key] for key in same]
+
+
+@pytest.mark.parametrize("steps", [1, 7, 39, 50])
+def test_a_training_is_measured_twenty_times_at_most(tmp_path, steps):
+    train(tmp_path, f"{WORDS} flow_steps={steps}")
+    (folder,) = flow_folders(tmp_path)
+    seen = [int(line.split(",")[0]) for line in (folder / "training.csv").read_text().splitlines()[1:]]
+    assert len(seen) == min(steps, 20) == len(set(seen)) and seen[-1] == steps
 
 
 def test_a_run_keeps_its_flow(tmp_path):
@@ -152,9 +171,15 @@ def test_a_damaged_flow_is_refused_and_a_damaged_checkpoint_starts_again(tmp_pat
     assert run_command(words) == 0
     assert f"{folder / 'checkpoint.pt'} is damaged" in capsys.readouterr().err
     assert_identical(outcome(tmp_path / "whole"), {name: run for name, run in outcome(tmp_path).items()})
-    (folder / "flow.pt").write_bytes(b"no flow")
-    assert run_command([*words, "overwrite=true"]) == 2
-    assert capsys.readouterr().err.splitlines()[-1].startswith(f"run.py: {folder / 'flow.pt'} is damaged: ")
+    whole = (folder / "flow.pt").read_bytes()
+    bit = bytes([whole[len(whole) // 2] ^ 64])
+    for content in (b"no flow", whole[: len(whole) // 2] + bit + whole[len(whole) // 2 + 1 :], whole[:-9]):
+        (folder / "flow.pt").write_bytes(content)
+        assert run_command([*words, "overwrite=true"]) == 2
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert said.startswith(f"run.py: {folder / 'flow.pt'} is damaged (") and said.endswith("trains the flow again")
+    (folder / "flow.pt").unlink()
+    assert run_command([*words, "overwrite=true"]) == 0
 
 
 def test_a_process_waits_for_another_that_trains_the_same_flow(tmp_path, monkeypatch, capsys):
@@ -165,7 +190,8 @@ def test_a_process_waits_for_another_that_trains_the_same_flow(tmp_path, monkeyp
 
         def finish():
             looked.wait()
-            shutil.copy(flow_folders(tmp_path / "whole")[0] / "flow.pt", folder.path / "flow.pt")
+            finished = flow_folders(tmp_path / "whole")[0] / "flow.pt"
+            replace_file(folder.path / "flow.pt", lambda file: file.write(finished.read_bytes()))
 
         other = threading.Thread(target=finish)
         other.start()
@@ -193,17 +219,19 @@ def test_a_flow_that_leaves_much_outside_is_noted(tmp_path, capsys):
 
 def test_the_checkpoint_of_a_flow_cannot_be_written(tmp_path, monkeypatch, capsys):
     """The training of the flow goes on without it."""
-    original = flows.replace_file
 
     def full(path, write):
-        if path.name == "checkpoint.pt":
+        if path.name in ("checkpoint.pt", "training.csv"):
             raise OSError(28, "No space left on device", str(path))
-        original(path, write)
+        replace_file(path, write)
 
     monkeypatch.setattr(flows, "SECONDS", 0.0)
+    monkeypatch.setattr(tensors, "replace_file", full)
     monkeypatch.setattr(flows, "replace_file", full)
     train(tmp_path, WORDS)
-    assert "no checkpoint of the flow at step 1: no space left on device" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no checkpoint of the flow at step 1: no space left on device" in said
+    assert "no training.csv of the flow at step 1: no space left on device" in said
     assert len(find_runs(tmp_path)) == 2
 
 
@@ -219,6 +247,33 @@ def test_play_at_random_stays_feasible_and_repeats_itself():
 def test_wrong_settings_are_one_line(words, said, capsys):
     assert run_command(["algo=DFlow", "env=R+L2", words]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("how, other", [("mle", "reverse"), ("reverse", "mle")])
+def test_a_setting_of_the_other_training_is_refused(how, other, capsys):
+    words = ["algo=DFlow,SFlow", "env=R+L2", "dry=true"]
+    assert run_command([*words, f"flow={how}", f"{how}_softness=0.3"]) == 0
+    capsys.readouterr()
+    assert run_command([*words, f"flow={how}", f"{other}_softness=0.3"]) == 2
+    said = f"run.py: {other}_softness applies only with flow={other}, not with flow={how}\n"
+    assert capsys.readouterr().err == said
+
+
+def test_sets_that_are_empty_somewhere(tmp_path, monkeypatch):
+    """The least violating actions are a face of the box where the second joint is fast."""
+
+    class Rows(LinearConstraint):
+        def A(self, obs):
+            return torch.tensor([[1.0, 0.0], [-1.0, 0.0]]).expand(*obs.shape[:-1], 2, 2)
+
+        def b(self, obs):
+            return torch.stack([torch.full_like(obs[..., 6], 0.5), 0.5 - 4.0 * (obs[..., 6].abs() > 0.2)], -1)
+
+    row = Task(Reacher, Rows(dim=2, on_empty="least"), "empty somewhere", "-", steps=100)
+    monkeypatch.setitem(envs.TASKS, "R+Empty", row)
+    for how in ("reverse", "mle"):
+        train(tmp_path, WORDS.replace("R+O10", "R+Empty").replace("3,5", "3") + f" flow={how}")
+    assert len(find_runs(tmp_path)) == 2 and all(read_run(run).result for run in find_runs(tmp_path))
 
 
 def test_other_algorithms_have_no_settings_of_flows(capsys):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from plots.grouping import DAGGER, count_diverged, final_return, group_runs, statistic
-from plots.paper import DEFAULT_BATCH, Statistic, order_algos, order_tasks, read_paper
+from plots.paper import COLORS, DEFAULT_BATCH, Statistic, order_algos, order_tasks, read_paper
 from plots.rewards import decimals
 from plots.starts import adjusted_returns, is_on_reacher
 from store.folder import Run
@@ -42,15 +42,13 @@ def read_cells(root: str | Path) -> Cells:
 
 
 def overview(cells: Cells) -> str:
-    """README's table: a row a map, a column each for TD3 and SAC on a task, our mean beside the paper's.
+    """README's table of the paper's algorithms: a row a map, a column each for TD3 and SAC on a task, our mean first.
 
     The first letter of a name is that of its base, D or S; the rest is its map. NFW stands alone, beside TD3's.
     """
     found: dict[tuple[str, str], dict[str, str]] = {}
-    names = {
-        algo: algo[1:] if algo[0] in "DS" else algo
-        for algo in order_algos({algo for by_algo in cells.values() for algo in by_algo})
-    }
+    paper = {algo for by_algo in cells.values() for algo in by_algo if algo in COLORS}
+    names = {algo: algo[1:] if algo[0] in "DS" else algo for algo in order_algos(paper)}
     for task in order_tasks(cells):
         for algo in names:
             if runs := cells[task].get(algo):

@@ -80,6 +80,16 @@ def test_a_run_with_other_settings_or_without_result_is_not_reproduced(tmp_path)
     assert overview(cells).splitlines()[2:] == [f"| Pro | **{result:.2f}** (n=1) / -4.65 ± 0.59 |"]
 
 
+def test_methods_that_the_paper_has_not_are_in_the_detailed_table_alone(tmp_path):
+    pro = next(published for published in read_published(DATA, ["R+L2"], ["DPro"]))
+    later = replace(pro.run, algo="DFlow", variant="DFlow", config=pro.run.config | {"algo": "DFlow"})
+    write_published(tmp_path / "R+L2", [pro, PublishedRun(later, pro.info)])
+    cells = read_cells(tmp_path)
+    assert [row.split(" | ")[0] for row in overview(cells).splitlines()[2:]] == ["| Pro"]
+    assert re.search(r"\| DPro \| .* \| -4.65 ± 0.59 \| – \|", details(cells).splitlines()[2])
+    assert re.search(r"\| DFlow \| .* \| – \| – \|", details(cells).splitlines()[3])
+
+
 def test_runs_that_diverged_count_with_their_best_parameters_and_are_marked(tmp_path):
     published = next(published for published in read_published(DATA, ["R+L2"], ["DPre"]))
     finished = published.run

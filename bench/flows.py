@@ -7,7 +7,7 @@
 Words: `env=` and `flow=` (lists), every other setting of a flow, and
 
     every=N            a row each N steps from step 0 on, not at the end alone
-    stop=SHARE         ends a training at the first row with this accuracy (1: all samples)
+    stop=SHARE         ends a training at the first row with this accuracy
     recipe=published   widths, learning rates, softness and steps of FlowPG (flow=mle) and CV-Flow (flow=reverse); the
                        rate stays the same, and no point is moved to the box's faces
 
@@ -17,6 +17,7 @@ measures left out; accuracy; that on the box's faces; recall (core/flow_training
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
@@ -83,7 +84,7 @@ def main(argv: Sequence[str]) -> int:
         known_name("recipe", words.get("recipe", "published"), ("published",))
         published = "recipe" in words
         every = whole_number("every", words["every"]) if "every" in words else 0
-        stop = parse_share(words.get("stop", "1"))
+        stop = parse_share(words["stop"]) if "stop" in words else math.inf
         settings = {key: text for key, text in words.items() if key not in ("env", "flow", "every", "stop", "recipe")}
         cells = [
             cell

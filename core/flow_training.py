@@ -74,22 +74,23 @@ class FlowTraining:
     def _further_out(self, obs: Tensor, count: int, stop_if_asked: Callable[[], None]) -> Tensor:
         """`count` of obs (n, k), moved to 0 to `FURTHEST` times their distance from the mean of all.
 
-        Where the set breaks down there, they stay where they are.
+        One whose set is empty there stays where it is. If the set breaks down at one of them, all do.
         """
         some = obs[torch.randint(len(obs), (count,), generator=self.generator)]
         mean = obs.mean(0)
         moved = mean + FURTHEST * torch.rand(count, 1, generator=self.generator) * (some - mean)
-        checked_before = check_inputs()
+        checked_before, empty = check_inputs(), []
         try:
             for chunk in moved.split(_CHUNK):
                 stop_if_asked()
                 self.constraint.project(chunk, chunk.new_zeros(len(chunk), self.constraint.dim))
                 self.constraint.center(chunk)
+                empty.append(self.constraint.least_violation(chunk) > 0.0)
         except ConstraintError:  # a set of one's own need not exist where the robot cannot be
             return some
         finally:
             check_inputs(checked_before)
-        return moved
+        return torch.where(torch.cat(empty).unsqueeze(-1), some, moved)
 
     def _feasible(self, obs: Tensor, stop_if_asked: Callable[[], None]) -> Tensor:
         """An action (n, d) for each of obs (n, k), uniform in its set.

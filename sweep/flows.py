@@ -31,6 +31,7 @@ from tqdm import tqdm
 
 import envs
 from algos import ALGORITHMS
+from constraints import ConstraintError, EmptySetError
 from core.config import Config
 from core.flow import Flow
 from core.flow_training import DivergedError, FlowTraining
@@ -59,8 +60,8 @@ SECONDS = 60.0
 """Time between checkpoints."""
 WAITING = 1.0
 """Seconds between looks at a flow that another process trains."""
-GOOD = 0.99
-"""Accuracy below which a note says how much will be projected."""
+GOOD, WIDE = 0.99, 0.5
+"""Accuracy and recall below which a note says so."""
 
 
 class FlowFolder:
@@ -137,15 +138,23 @@ def flow_of(
             print(f"waiting: {error}", file=sys.stderr)
             _wait(folder, stop_if_asked)
         except Interrupted:
-            print(f"interrupted in the training of {folder.path}; the same command resumes", file=sys.stderr)
+            before = folder.checkpoint()
+            step = before["training"]["step"] if before else 0
+            print(f"interrupted at step {step} of {folder.path}; the same command resumes", file=sys.stderr)
             raise
-    if trained["measures"]["accuracy"] < GOOD:
-        share = f"{100 * trained['measures']['accuracy']:.1f} %"
-        print(
-            f"note: the flow of {config.env} takes {share} of the box into the set; the rest is projected",
-            file=sys.stderr,
-        )
+        except ConstraintError as error:
+            hint = "; on_empty='least' takes the least violating actions there" * isinstance(error, EmptySetError)
+            raise ConfigError(f"the flow of {config.env} cannot be trained: {one_line(error)}{hint}") from error
+    accuracy, recall = (trained["measures"][name] for name in ("accuracy", "recall"))
+    if accuracy < GOOD:
+        _note(f"the flow of {config.env} takes {100 * accuracy:.1f} % of the box into the set; the rest is projected")
+    if recall < WIDE:
+        _note(f"the flow of {config.env} reaches {100 * recall:.1f} % of the set; no policy can use the rest")
     return trained
+
+
+def _note(text: str) -> None:
+    print(f"note: {text}", file=sys.stderr)
 
 
 def _wait(folder: FlowFolder, stop_if_asked: Callable[[], None]) -> None:

@@ -33,7 +33,8 @@ def load_plugins(words: Sequence[str]) -> list[str]:
     paths = [Path(text).expanduser().absolute() for text in texts]
     for path in paths:  # before any of them is imported
         if not path.is_file() or path.suffix != ".py":
-            raise ConfigError(f"bad value {str(path)!r} for {KEY}: expected a Python file (.py)")
+            missing = "" if path.is_file() else ", and there is no such file"
+            raise ConfigError(f"bad value {str(path)!r} for {KEY}: expected a Python file (.py){missing}")
     for path in paths:
         _load(path)
     return [word for word in words if word not in mine]

@@ -342,6 +342,21 @@ def test_states_further_out_are_left_where_the_set_breaks_down_there():
 
 
 @pytest.mark.usefixtures("few_states")
+def test_states_whose_set_would_be_empty_further_out_stay_where_they_are():
+    class Rows(LinearConstraint):
+        def A(self, obs):
+            return torch.tensor([[1.0, 0.0], [-1.0, 0.0]]).expand(*obs.shape[:-1], 2, 2)
+
+        def b(self, obs):  # 0.3 <= a_1 <= 1 - |o|, which is empty from |o| = 0.7 on
+            return torch.stack([1.0 - obs[..., 0].abs(), torch.full_like(obs[..., 0], -0.3)], -1)
+
+    rows = Rows(dim=2, on_empty="least")
+    training = FlowTraining(Flow(), rows, states())
+    assert rows.least_violation(training.obs).max() == 0.0
+    assert training.obs[:, 1].abs().max() > 0.8  # the others are further out
+
+
+@pytest.mark.usefixtures("few_states")
 def test_a_closed_form_tells_that_it_breaks_down_there():
     """Its coefficients are checked however many calls there were, and in the process's own way again afterwards."""
     ball = Ball(lambda obs: 0.8 - obs.square().sum(-1), 2)  # positive up to the corners of the cube

@@ -1,6 +1,7 @@
 """The training of a cell's flow, before its seeds: once, interrupted, resumed, damaged, shared."""
 
 import json
+import re
 import shutil
 import threading
 import time
@@ -56,9 +57,12 @@ def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path,
     """In random play, in the training of the flow, in warm-up, between gradient steps, in evaluations."""
     whole = Breaks()
     train(tmp_path / "whole", words, whole)
-    check = Breaks(*range(5, whole.calls, whole.calls // 9))
+    # After the first break, random play is done at some 15 calls, and the flow's training at some 40.
+    check = Breaks(5, 30, *range(60, whole.calls, whole.calls // 9))
     assert train_through(tmp_path / "broken", words, check) >= 8
-    assert "interrupted in the training of" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert re.search(r"interrupted at step 0 of \S+/flows/", said)  # in random play
+    assert re.search(r"interrupted at step [1-9]\d? of \S+/flows/", said)
     assert_identical(outcome(tmp_path / "whole"), outcome(tmp_path / "broken"))
     one, other = (flow_folders(tmp_path / root)[0] for root in ("whole", "broken"))
     assert one.name == other.name and {path.name for path in other.iterdir()} == {path.name for path in one.iterdir()}
@@ -212,9 +216,12 @@ def test_a_process_takes_over_from_another_that_ended_without_a_flow(tmp_path, m
     assert len(find_runs(tmp_path)) == 2 and folder.read()["measures"]["step"] == 20
 
 
-def test_a_flow_that_leaves_much_outside_is_noted(tmp_path, capsys):
+def test_a_flow_that_leaves_much_outside_is_noted(tmp_path, monkeypatch, capsys):
     train(tmp_path, f"{WORDS} flow_steps=1")
     assert "note: the flow of R+O10 takes " in capsys.readouterr().err
+    monkeypatch.setattr(flows, "WIDE", 1.1)
+    train(tmp_path, WORDS.replace("3,5", "8"))
+    assert "% of the set; no policy can use the rest" in capsys.readouterr().err
 
 
 def test_the_checkpoint_of_a_flow_cannot_be_written(tmp_path, monkeypatch, capsys):
@@ -259,7 +266,7 @@ def test_a_setting_of_the_other_training_is_refused(how, other, capsys):
     assert capsys.readouterr().err == said
 
 
-def test_sets_that_are_empty_somewhere(tmp_path, monkeypatch):
+def test_sets_that_are_empty_somewhere(tmp_path, monkeypatch, capsys):
     """The least violating actions are a face of the box where the second joint is fast."""
 
     class Rows(LinearConstraint):
@@ -271,9 +278,15 @@ def test_sets_that_are_empty_somewhere(tmp_path, monkeypatch):
 
     row = Task(Reacher, Rows(dim=2, on_empty="least"), "empty somewhere", "-", steps=100)
     monkeypatch.setitem(envs.TASKS, "R+Empty", row)
+    words = WORDS.replace("R+O10", "R+Empty").replace("3,5", "3")
     for how in ("reverse", "mle"):
-        train(tmp_path, WORDS.replace("R+O10", "R+Empty").replace("3,5", "3") + f" flow={how}")
+        train(tmp_path, f"{words} flow={how}")
     assert len(find_runs(tmp_path)) == 2 and all(read_run(run).result for run in find_runs(tmp_path))
+    monkeypatch.setattr(row.constraint, "on_empty", "error")
+    assert run_command([*words.split(), f"results={tmp_path / 'other'}"]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("run.py: the flow of R+Empty cannot be trained: sample ")
+    assert said.endswith("the set is empty; on_empty='least' takes the least violating actions there")
 
 
 def test_other_algorithms_have_no_settings_of_flows(capsys):

@@ -103,7 +103,7 @@ def test_a_program_can_be_its_own_plugin(plugin):
 @pytest.mark.parametrize(
     "name, text, said",
     [
-        ("other.py", None, "expected a Python file (.py)"),
+        ("other.py", None, "expected a Python file (.py), and there is no such file"),
         ("other.txt", "", "expected a Python file (.py)"),
         ("random.py", "", "has the name of another module, random: rename it"),
         ("algos.py", "", "has the name of another module, algos: rename it"),

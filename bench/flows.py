@@ -80,7 +80,8 @@ def main(argv: Sequence[str]) -> int:
         print(__doc__)
         return 0
     try:
-        words = parse_words(argv, ("env", "every", "stop", "recipe", *(f.name for f in fields(Flow))))
+        of_training = [f.name for f in fields(Flow) if not f.metadata.get("of_density")]
+        words = parse_words(argv, ("env", "every", "stop", "recipe", *of_training))
         known_name("recipe", words.get("recipe", "published"), ("published",))
         published = "recipe" in words
         every = whole_number("every", words["every"]) if "every" in words else 0

@@ -14,6 +14,7 @@ from helpers import Breaks, assert_identical, config_of, outcome, run_command, t
 
 import envs
 from algos import ALGORITHMS, load_policy
+from bench import flows as flows_benchmark
 from constraints import LinearConstraint
 from core import flow_training
 from core.flow import Flow
@@ -292,3 +293,48 @@ def test_sets_that_are_empty_somewhere(tmp_path, monkeypatch, capsys):
 def test_other_algorithms_have_no_settings_of_flows(capsys):
     assert run_command(["algo=DGauge", "env=R+L2", "flow=mle"]) == 2
     assert "flow does not apply to DGauge on R+L2" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------- its benchmark
+
+
+def bench_rows(capsys, *words):
+    assert flows_benchmark.main(["env=R+O10", *words]) == 0
+    return [line.split(" | ") for line in capsys.readouterr().out.splitlines()[1:]]
+
+
+def test_the_benchmark_measures_what_a_run_trains(tmp_path, capsys):
+    train(tmp_path, WORDS)
+    (folder,) = flow_folders(tmp_path)
+    last = (folder / "training.csv").read_text().splitlines()[-1].split(",")
+    capsys.readouterr()
+    (row,) = bench_rows(capsys, "flow=reverse")
+    assert row[:3] == ["R+O10", "reverse", "20"]
+    assert row[4:] == [f"{100 * float(share):.1f} %" for share in last[2:5]]
+
+
+def test_the_benchmark_has_curves_and_the_published_recipe(capsys):
+    curve = bench_rows(capsys, "every=10")
+    assert [row[1:3] for row in curve] == [[way, step] for way in ("reverse", "mle") for step in ("0", "10", "20")]
+    (first,) = bench_rows(capsys, "flow=mle", "every=10", "stop=0.01")
+    assert first == curve[3][:3] + first[3:4] + curve[3][4:]  # untrained, but for the seconds
+    published = bench_rows(capsys, "recipe=published", "flow=reverse", "flow_steps=20", "every=10")
+    assert [row[2] for row in published] == ["0", "10", "20"] and published[2][4:] != curve[2][4:]
+
+
+@pytest.mark.parametrize(
+    "word, named",
+    [
+        ("recipe=mine", "'mine'"),
+        ("stop=0", "'0' for stop"),
+        ("every=0", "'0' for every"),
+        ("flow=foo", "'foo'"),
+        ("env=R+L9", "'R+L9'"),
+        ("steps=5", "'steps'"),
+        ("flow_entropy=action", "'flow_entropy'"),
+    ],
+)
+def test_the_benchmark_names_a_wrong_word(word, named, capsys):
+    assert flows_benchmark.main([word]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("bench/flows.py: ") and said.count("\n") == 1 and named in said

@@ -172,6 +172,7 @@ def _train(config: Config, flow: Flow, folder: FlowFolder, stop_if_asked: Callab
     """Train the flow, from its checkpoint where there is one, and save it."""
     folder.begin()
     before, rows, started = folder.checkpoint(), [], time.perf_counter()
+    info = describe_environment(sys.orig_argv[1:])
     interval = 0.5 if sys.stderr.isatty() else 60.0  # seconds, as of `core.progress`
     name = f"{config.algo} {config.env} flow"
     with tqdm(total=flow.flow_steps, desc=name, unit="step", mininterval=interval, maxinterval=interval) as bar:
@@ -208,7 +209,6 @@ def _train(config: Config, flow: Flow, folder: FlowFolder, stop_if_asked: Callab
             raise ConfigError(
                 f"the flow of {config.env} cannot be trained: {error}; try a smaller flow_learning_rate"
             ) from error
-    info = describe_environment(sys.orig_argv[1:])
     folder.finish({"state": training.network.state_dict(), "measures": rows[-1], "info": info})
 
 

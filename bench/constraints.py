@@ -15,8 +15,8 @@ the paper's tasks and the sets of `bench/own_sets.py`, such as 2x6 for two rows 
 The baselines take the same numbers: `osqp` (a loop; projection on linear sets; tolerance 1e-6), `gurobi` (a loop;
 projection), `cvxpylayers` (projection and its gradient on the paper's sets, in their most compact forms), `qpth`
 (batched; the same on linear sets), `linprog` (SciPy's HiGHS, a loop; centre and oracle of linear sets). Those not
-installed are left out: `pip install -e '.[bench]'` for cvxpylayers, `pip install --no-deps qpth` (it asks for numpy 1),
-`pip install gurobipy`.
+installed are left out: `pip install -e '.[bench]'` for osqp, gurobi and cvxpylayers, `pip install --no-deps qpth` (it
+asks for numpy 1).
 """
 
 from __future__ import annotations

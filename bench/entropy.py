@@ -8,8 +8,8 @@ task, means over `states` that a run's warm-up visits:
 
 - target: SAC's, -d.
 - uniform: the entropy of the uniform distribution on the feasible set, the log of its volume. No policy has more.
-- SRad, SAlpha: the most that N(mean, diag std^2) has after the map, in the measure of `entropy=paper`; found by
-  gradient ascent on mean and std in each state, so at least, and measured with noise that the ascent has not seen.
+- SRad, SAlpha: the most that N(mean, diag std^2) has after the map, in the measure of `entropy=paper`. Gradient ascent
+  on mean and std finds it in each state, so it is a lower bound. It is measured with noise that the ascent did not see.
 - SRad ball, SAlpha ball: the same in the measure of `entropy=ball`.
 
 A target above what the map can reach makes the temperature rise without end; one just below keeps the policy as random

@@ -4,7 +4,7 @@
     python bench/flows.py env=HC+O flow=mle flow_steps=10000 flow_width=256 every=2500
     python bench/flows.py env=R+L2 recipe=published every=250 stop=0.99
 
-Words: `env=` and `flow=` (lists), every other setting of a flow, and
+Words: `env=` and `flow=` (lists), every other setting of a flow's training, and
 
     every=N            a row each N steps from step 0 on, not at the end alone
     stop=SHARE         ends a training at the first row with this accuracy

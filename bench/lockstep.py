@@ -131,7 +131,7 @@ def measure_agreement(name: str, task: str, device: torch.device) -> list[dict[s
 
 @torch.no_grad()
 def round_differently(agent: Agent, generator: torch.Generator) -> None:
-    """Change every parameter by about half the distance to the next float32, up or down."""
+    """Change every parameter by at most two steps of float32, up or down."""
     for network in agent.networks().values():
         for parameter in network.parameters():
             parameter.mul_(1 + 6e-8 * torch.randn(parameter.shape, generator=generator).sign())

@@ -11,7 +11,7 @@ from constraints import Constraint, Intersection, LinearConstraint, QuadraticCon
 def legs(obs: Tensor) -> Tensor:
     """The joint velocities of each leg of a HalfCheetah (..., 2, 6): its mechanical power is a row."""
     velocity = obs[..., 11:17].unflatten(-1, (2, 3))
-    return torch.diag_embed(velocity.movedim(-2, -1), dim1=-2, dim2=-1).transpose(-3, -2).flatten(-2)
+    return torch.diag_embed(velocity.movedim(-2, -1)).movedim(-3, -1).flatten(-2)
 
 
 def random_rows(rows: int, dim: int) -> LinearConstraint:

@@ -4,7 +4,8 @@
     python bench/shared_gpu.py processes=1,2 algo=SPre env=HC+O seeds=3 seconds=5
     python bench/shared_gpu.py device=cpu processes=1,2
 
-It prints a line for each number of processes, without and with the Multi-Process Service, where that is installed.
+It prints a line for taking turns and, where the Multi-Process Service is installed, one for sharing, with a column for
+each number of processes.
 """
 
 from __future__ import annotations

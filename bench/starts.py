@@ -4,8 +4,8 @@
     python bench/starts.py results/R+L2/DPre/seed=0 seeds=0-99 episodes=20000
 
 The run's best policy plays the final episodes of each of `seeds` (default 0-9) and then `episodes` others (default
-5,000), whose mean is the true one up to its standard error. Prints, a seed a row, the mean return as it is and adjusted
-(`plots/starts.py`), and how far both are from the true mean.
+5,000), whose mean is the true one up to its standard error. Prints, a seed a row, how far the mean return is from the
+true mean, as it is and adjusted (`plots/starts.py`).
 """
 
 from __future__ import annotations

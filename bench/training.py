@@ -4,7 +4,7 @@
     python bench/training.py base=TD3 seeds=1,10 threads=1 rounds=5 steps=10 out=bench/results
 
 TD3 is DPre (batch 100, layers of 400 and 300), SAC is SPre (batch 256, layers of 256 and 256), both on HalfCheetah
-(HC+O) with the paper's settings. Beside each number of seeds in lockstep stand
+(HC+O) with the paper's settings. For each number of seeds in lockstep, the table also has
 
 - the floor: the matrix products of one update in the same shapes and nothing else (bench/floor.py);
 - if it is installed, Stable-Baselines3's algorithm of the same name with one seed and the same batch, layers and rate,

@@ -43,6 +43,7 @@ from plots.others import Source, cells_in, parse_sources, read_source
 from plots.paper import COLORS, order_algos, order_tasks
 from plots.rewards import comparison_table, reward_table
 from plots.style import own_algos
+from store.files import user_path
 from store.output import forgiving_output
 from sweep.plugins import load_plugins
 
@@ -60,7 +61,7 @@ def plot_results(words: Sequence[str], options: dict[str, str]) -> list[Path]:
         known_name("value of paper", options["paper"], ["beside"])
     groups = _read(sources, options)
     first = sources[0].path
-    out = Path(options.get("out", first if first.is_dir() else first.parent)).expanduser()
+    out = user_path(options.get("out", first if first.is_dir() else first.parent))
     aggregates = aggregate(groups)
     left_out = list_left_out(groups)
     diverged = list_diverged(groups)
@@ -152,7 +153,7 @@ def plot_actions(words: Sequence[str], options: dict[str, str]) -> list[Path]:
     from plots.illustrations import draw_actions
 
     run = _path(words, "folder of a run").absolute()
-    out = Path(options.get("out", run.parent.parent.parent)).expanduser()
+    out = user_path(options.get("out", run.parent.parent.parent))
     return draw_actions(run, out / "figures", _formats(options, style.FORMATS))
 
 
@@ -164,7 +165,7 @@ def plot_runtime(words: Sequence[str], options: dict[str, str]) -> list[Path]:
 
 
 def _out(options: dict[str, str]) -> Path:
-    return Path(options.get("out", RESULTS)).expanduser()
+    return user_path(options.get("out", RESULTS))
 
 
 def _formats(options: dict[str, str], choices: Sequence[str]) -> list[str]:
@@ -181,7 +182,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]
 def _path(words: Sequence[str], what: str) -> Path:
     if len(words) != 1:
         raise ConfigError(f"expected one {what}, got {len(words)}: {' '.join(words) or 'none'}")
-    return Path(words[0]).expanduser()
+    return user_path(words[0])
 
 
 def _no_more(words: Sequence[str]) -> None:

@@ -90,7 +90,8 @@ def to_markdown(table: Table) -> str:
 
     lines = [table.header, [":--" if j < table.labels else "--:" for j in range(len(table.header))]]
     lines += [[cell(content) for content in row] for section in table.sections for row in section]
-    return f"{table.title}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    escaped = ([text.replace("|", r"\|") for text in line] for line in lines)
+    return f"{table.title}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in escaped)
 
 
 def to_latex(table: Table) -> str:
@@ -146,10 +147,20 @@ def _latex_line(texts: Sequence[str]) -> str:
     return " & ".join(texts) + r" \\"
 
 
+_ESCAPED = {character: f"\\{character}" for character in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": "$<$",
+    ">": "$>$",
+}
+"""What LaTeX reads as commands in a text."""
+
+
 def _escape(text: str) -> str:
-    text = re.sub(r"([&%$#_{}])", r"\\\1", text)
+    text = re.sub("[" + re.escape("".join(_ESCAPED)) + "]", lambda found: _ESCAPED[found[0]], text)
     text = re.sub(r"(?<![\w-])-(?=[\d.])", "$-$", text)
-    return text.replace("±", r"$\pm$").replace("–", "--").replace(">", "$>$").replace("†", r"$^\dagger$")
+    return text.replace("±", r"$\pm$").replace("–", "--").replace("†", r"$^\dagger$")
 
 
 def write_csv(path: Path, records: Sequence[dict[str, Any]]) -> None:

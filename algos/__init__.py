@@ -22,7 +22,7 @@ from core.config import Config, PenaltyConfig, keys_of, restore_settings
 from core.flow import Flow
 from core.maps import Alpha, Gauge, Map, Placement, Project, Radial
 from core.words import ConfigError, NameTable, known_name
-from store.files import one_line
+from store.files import one_line, user_path
 from store.info import missing_plugin
 
 
@@ -150,7 +150,7 @@ def load_policy(folder: str | Path, which: str = "best") -> Policy:
     Raises ConfigError, a ValueError, for another `which`, for a folder without a run or without these parameters, and
     for an algorithm or a task that is not known. Import the file that defines your own before.
     """
-    folder = Path(folder).expanduser()
+    folder = user_path(folder)
     settings = settings_of(folder)
     try:
         known_name("algorithm", settings["algo"], ALGORITHMS)

@@ -65,6 +65,7 @@ from bench.mps import shared_gpu
 from core.config import parse_seeds
 from core.words import ConfigError, parse_words, split_names, whole_number, whole_numbers
 from envs import TASKS
+from store.files import user_path
 from store.folder import find_runs, read_run
 from store.provenance import describe_environment
 from sweep.cells import format_seeds
@@ -324,7 +325,7 @@ def parse_arguments(arguments: Sequence[str]) -> Options:
         split_names("cells", options["cells"], dict.fromkeys(PAPER)),
         parse_seeds(options["cell_seeds"]),
         torch.device(options["device"]),
-        Path(options["out"]).expanduser().resolve(),
+        user_path(options["out"]).resolve(),
         time.monotonic() + 60 * minutes,
     )
 

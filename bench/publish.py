@@ -6,7 +6,7 @@
     python bench/publish.py results/ out=DIR                 # to another folder
 
 A cell (task, algorithm and settings) is published with all its seeds or not at all, so that no seed is dropped. It is
-refused where a run has not ended, where its provenance is missing, names uncommitted changes or more than one commit,
+refused where a run has not ended, where its provenance is missing, names uncommitted code or more than one commit,
 where its settings are not those that its folder says and, without `settings=any`, where they are not the paper's. A
 seed that is published already stays as it is, and a second run of it is refused alone. The command names every refused
 run with the reason, publishes the rest, and exits with code 1.
@@ -30,7 +30,7 @@ from algos import ALGORITHMS, saved_config
 from core.config import differences
 from core.words import ConfigError, parse_words, split_names
 from envs import TASKS
-from store.files import one_line
+from store.files import one_line, user_path
 from store.folder import Run, find_runs, has_ended, parse_variant, read_run, variant_folder, variant_name
 from store.published import PublishedRun, read_published, write_published
 from sweep.cells import paper_config
@@ -103,6 +103,9 @@ def _check_provenance(info: Mapping[str, Any]) -> None:
         raise RefusedError("it ran with uncommitted changes")
     if len(commits) > 1:
         raise RefusedError(f"its parts ran at different commits: {', '.join(commits)}")
+    for source in (source for part in parts for source in part.get("sources", [])):
+        if source["commit"] is None or source["dirty"]:
+            raise RefusedError(f"it ran with {source['file']}, of which no commit has that content")
 
 
 def _check_settings(run: Run, any_settings: bool) -> None:
@@ -124,7 +127,7 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0].startswith("-") or "=" in argv[0]:
         print(__doc__)
         return 0 if argv and argv[0] in ("-h", "--help") else 2
-    root = Path(argv[0]).expanduser()
+    root = user_path(argv[0])
     try:
         words = parse_words(argv[1:], ("env", "algo", "out", "settings"))
         if not root.is_dir():
@@ -133,10 +136,11 @@ def main(argv: Sequence[str]) -> int:
         algos = split_names("algorithm", words["algo"], ALGORITHMS) if "algo" in words else None
         if words.get("settings", "any") != "any":
             raise ConfigError(f"bad value {words['settings']!r} for settings (choices: any)")
-        out = Path(words.get("out", OUT)).expanduser()
+        out = user_path(words.get("out", OUT))
         published, refused = publish(root, out, tasks, algos, "settings" in words)
-    except (ConfigError, ValueError) as error:
-        print(f"publish.py: {one_line(error)}", file=sys.stderr)
+    except (OSError, ValueError) as error:  # a ConfigError is a ValueError
+        where = f"{error.filename}: " if isinstance(error, OSError) else ""
+        print(f"publish.py: {where}{one_line(error)}", file=sys.stderr)
         return 2
     for line in published or ["nothing new to publish"]:
         print(line)

@@ -40,6 +40,7 @@ from bench.common import TASK, fill_replay, machine_name, make_agent
 from core.cuda_graph import GradientSteps
 from core.words import ConfigError, parse_words, split_names, whole_number, whole_numbers
 from plots.runtime import COLUMNS, runtime_table
+from store.files import user_path
 from sweep.train import check_device
 from tables import to_terminal
 
@@ -99,7 +100,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], list[int], dic
     batches = whole_numbers("batch", options["batch"])
     counts = {key: whole_number(key, options[key]) for key in ("trials", "steps", "seeds")}
     names = split_names("algo", options["algo"], ALGORITHMS)
-    return names, batches, counts, options["device"], Path(options["out"]).expanduser()
+    return names, batches, counts, options["device"], user_path(options["out"])
 
 
 def run_trials(names: Sequence[str], batches: Sequence[int], counts: dict[str, int], device: str, path: Path) -> None:

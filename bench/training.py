@@ -47,6 +47,7 @@ from bench.floor import Floor, update_products
 from bench.peer import INSTALLED, Peer, peer_version
 from bench.phases import OUTSIDE, UPDATE, Phases, measure_phases, new_trainer
 from core.words import ConfigError, parse_words, split_names, whole_number, whole_numbers
+from store.files import user_path
 from tables import MISSING, Table, text_cells, to_terminal, write_csv, write_table
 
 ALGO = {"TD3": "DPre", "SAC": "SPre"}
@@ -273,7 +274,7 @@ def parse_arguments(arguments: Sequence[str]) -> Options:
         list(dict.fromkeys(whole_numbers("threads", options["threads"]))),
         whole_number("rounds", options["rounds"]),
         steps,
-        Path(options["out"]).expanduser(),
+        user_path(options["out"]),
     )
 
 

@@ -9,6 +9,8 @@ from torch import Tensor
 
 _MARGIN = 1e-6
 """No step ends nearer to the end of its chord than this share of it, so that rounding keeps the point inside."""
+_THIN = 1e-9
+"""Half the width that a flat set is given, so that its axes span the space."""
 
 
 def uniform(lead: tuple[int, ...], like: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -82,6 +84,8 @@ def round_axes(oracle: Callable[[Tensor], Tensor], center: Tensor) -> Tensor:
         longest = across.square().sum(-2).argmax(-1)[..., None, None].expand(*center.shape, 1)
         normal = torch.nn.functional.normalize(across.gather(-1, longest).squeeze(-1), dim=-1)
         axis = (oracle(normal) - oracle(-normal)) / 2.0
+        # A set that is flat in this direction is sampled within its tolerance (`on_empty="least"`).
+        axis = torch.where((axis == 0.0).all(-1, keepdim=True), _THIN * normal, axis)
         axes.append(axis)
         new = torch.nn.functional.normalize((across @ axis.unsqueeze(-1)).squeeze(-1), dim=-1, eps=0.0)
         across = across - new.unsqueeze(-1) * (across @ new.unsqueeze(-1)).mT

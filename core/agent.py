@@ -204,6 +204,7 @@ class Agent(Snapshots):
                 executed = pulled_back
         return Action(raw, executed, suggested if self.placement == "environment" else executed)
 
+    @torch.no_grad()
     def centers(self, obs: Tensor) -> Tensor | None:
         """The centres (..., d) of the sets at obs (..., n), None where the map needs none but the origin."""
         return self.constraint.center(obs) if self.stores_centers else None

@@ -6,9 +6,10 @@ made with `core.config.setting`, are keys of the command line for the algorithms
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import ClassVar, Literal, NamedTuple
 
 from torch import Tensor
@@ -69,9 +70,11 @@ class Map(ABC):
         return self.pull_back(constraint, obs, action, center)
 
     def configured(self, config: Config) -> Map:
-        """The map with the settings that `config` has of its fields."""
-        options = {f.name: getattr(config, f.name) for f in fields(self) if hasattr(config, f.name)}
-        return replace(self, **options) if options else self
+        """A copy of the map with the settings that `config` has of its fields."""
+        mine = copy.deepcopy(self)  # with what it has learned, and nothing that it learns later is the table's
+        for f in fields(self):
+            setattr(mine, f.name, getattr(config, f.name, getattr(self, f.name)))
+        return mine
 
     def propose(self, constraint: Constraint, obs: Tensor, suggested: Tensor) -> Tensor:
         """The action (..., d) before it is made feasible, whose violation training.csv has: the suggestion itself."""

@@ -26,6 +26,8 @@ class Moments:
     def __init__(self, seeds: Sequence[Seed], agent: Agent, replay: Replay, evaluator: Evaluator, timer: PhaseTimer):
         self.seeds, self.agent, self.replay = seeds, agent, replay
         self.evaluator, self.timer = evaluator, timer
+        self.step: int | None = None
+        """The least step in the last moment of a seed that had not ended; None without one."""
 
     def write(self, obs: Tensor, center: Tensor | None) -> None:
         """Write a checkpoint of every seed; obs (seeds, n) and `center` (seeds, d) are the present ones.
@@ -39,6 +41,7 @@ class Moments:
                 seed.checkpoints.write(moment, *content, *self._stored(seed), self.replay.added[seed.position])
             for seed in self.seeds:
                 seed.checkpoints.keep()
+            self._count()
         except OSError as error:
             step = max(seed.steps for seed in self.seeds)
             print(f"no checkpoint at step {step}: {one_line(error)}", file=sys.stderr)
@@ -64,6 +67,10 @@ class Moments:
             seed.restore(state)
             seed.checkpoints.resume(checkpoint)
         self.timer.restore(states[-1]["seconds"])
+        self._count()
+
+    def _count(self) -> None:
+        self.step = min((seed.steps for seed in self.seeds if not seed.ended), default=None)
 
     def _state(self, seed: Seed, obs: Tensor, center: Tensor | None) -> dict[str, Any]:
         """Everything about a seed but its transitions."""

@@ -19,7 +19,8 @@ class Linear(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]):
         super().__init__()
-        bound = 1 / math.sqrt(inputs)  # PyTorch's own initialisation of nn.Linear, which the paper's code base uses
+        # PyTorch's own initialisation of nn.Linear, as in the paper's code base. (Without inputs, a bias is left.)
+        bound = 1 / math.sqrt(max(inputs, 1))
         weight = torch.empty(len(generators), inputs, outputs)
         bias = torch.empty(len(generators), 1, outputs)
         for i, generator in enumerate(generators):

@@ -88,6 +88,7 @@ class Trainer:
                 self.stop_if_asked()
                 if self._all_steps() - self.steps_at_checkpoint >= self.config.checkpoint_every * len(live):
                     self._checkpoint()
+                    continue  # it may end seeds
                 self._sparing(self._advance, live)
         except BaseException as error:
             if isinstance(error, Interrupted):
@@ -129,16 +130,15 @@ class Trainer:
 
         There is no new checkpoint: training could not go on exactly from the middle of a step.
         """
-        rest = "no checkpoint yet"
-        if self.steps_at_checkpoint:
-            rest = f"the same command resumes from step {self.steps_at_checkpoint // len(self.seeds)}"
+        from_step = self.moments.step
+        rest = "no checkpoint yet" if from_step is None else f"the same command resumes from step {from_step}"
         step = max(seed.steps for seed in self.seeds)
         where = f"{self.config.algo} on {self.config.env}, seeds {', '.join(map(str, self.agent.seeds))}, step {step}"
         print(f"{where}: {type(error).__name__} ({rest})", file=sys.stderr)
 
     def _live(self) -> list[Seed]:
         """The seeds that have not ended. The folders of the others tell from here on how they did."""
-        if ended := [seed for seed in self.seeds if seed.ended and not seed.recorded]:
+        while ended := [seed for seed in self.seeds if seed.ended and not seed.recorded]:
             if due := [seed for seed in ended if seed.result_due]:
                 self._evaluate_failed(due)
             self._record_ends()
@@ -365,7 +365,7 @@ class Trainer:
         """
         self._checkpoint()
         for seed in self.seeds:
-            if seed.ended and not seed.recorded:
+            if seed.ended and not seed.recorded and not seed.result_due:  # the checkpoint may have ended more
                 seed.record_end(self.agent.state(seed.position))
 
     def _save_last(self) -> None:

@@ -230,7 +230,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         self.executed_actions, self.largest_violation = state["executed_actions"], state["largest_violation"]
 
     def render(self) -> np.ndarray | None:
-        """Picture (480, 480, 3), uint8, of the current state; None without `render_mode="rgb_array"`."""
+        """Picture (h, w, 3), uint8, of the current state; None without `render_mode="rgb_array"`."""
         self._refuse_closed("render")
         if self.render_mode != "rgb_array":
             return None
@@ -282,6 +282,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         if self._closed:
             raise gymnasium.error.ClosedEnvironmentError(f"{self.task}: {method}() after close(); make a new one")
 
+    @torch.no_grad()
     def _boundary(self, obs: np.ndarray) -> np.ndarray:
         """Points (k, 2) around the feasible set at `obs`, in order."""
         angle = torch.linspace(0, 2 * math.pi, 361, dtype=torch.float64)[:-1]
@@ -304,6 +305,7 @@ class ActionConstrainedEnv(gymnasium.Env):
             return InfeasibleActionError(f"{self._where()}: action {action} is not finite")
         return action
 
+    @torch.no_grad()  # coefficients may be learned
     def _admit(self, action: np.ndarray, violation: float) -> np.ndarray | InfeasibleActionError:
         """What the robot executes for a well-formed `action`, or the InfeasibleActionError that refuses it.
 

@@ -80,7 +80,7 @@ class Robot(ABC):
 
     @abstractmethod
     def render(self) -> np.ndarray:
-        """Picture (480, 480, 3), uint8, of the present state."""
+        """Picture (h, w, 3), uint8, of the present state."""
 
     @abstractmethod
     def close(self) -> None:

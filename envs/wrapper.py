@@ -108,6 +108,7 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         own = {"suggested_action": suggested, "executed_action": executed, "violation": np.float64(violation)}
         return obs, float(reward), terminated, truncated, {**info, **own}
 
+    @torch.no_grad()  # coefficients may be learned
     def _feasible(self, suggested: np.ndarray) -> tuple[np.ndarray, float]:
         """The feasible action (d,) of a suggestion (d,), and the suggestion's violation."""
         action = torch.from_numpy(suggested)

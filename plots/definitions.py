@@ -53,13 +53,19 @@ def hyperparameter_table() -> Table:
 
 
 def _configurations() -> dict[tuple[str, str], dict[str, Any]]:
-    """By group of robots and family of algorithms, every setting of any algorithm of this family."""
+    """By group of robots and family of algorithms, every setting of any algorithm of this family.
+
+    An algorithm with another value than those before it has columns of its own name.
+    """
     columns: dict[tuple[str, str], dict[str, Any]] = {}
     for group in dict.fromkeys(group for algorithm in ALGORITHMS.values() for group in algorithm.agent.paper):
         for name, algorithm in ALGORITHMS.items():
             config = algorithm.paper_config(name, "", group, steps=0)
             settings = {key: getattr(config, f.name) for key, f in keys_of(config).items()}
-            columns.setdefault((group, algorithm.agent.family), {}).update(settings)
+            column = columns.setdefault((group, algorithm.agent.family), {})
+            if any(column.get(key, value) != value for key, value in settings.items() if key != "algo"):
+                column = columns.setdefault((group, name), {})
+            column |= settings
     return columns
 
 

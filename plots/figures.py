@@ -105,14 +105,15 @@ def _draw_training(
     curves, common = _label_settings(by_settings)
     several = {curve.algo for curve in curves if sum(other.algo == curve.algo for other in curves) > 1}
     curves = [curve for curve in curves if curve.measures or curve.algo in several]
-    rows = list(dict.fromkeys(curve.measures for curve in curves))
+    # The order of the measures may differ: published runs have that of their file.
+    rows = list({frozenset(curve.measures): curve.measures for curve in curves}.values())
     if not rows:
         return []
     columns = 1 + max(map(len, rows))
     figure = Figure(figsize=(1.5 + 3.6 * columns, 1.0 + 3.2 * len(rows)), layout="constrained")
     panels = figure.subplots(len(rows), columns, sharex=True, squeeze=False)
     for measures, (first, *others) in zip(rows, panels, strict=True):
-        for curve in (curve for curve in curves if curve.measures == measures):
+        for curve in (curve for curve in curves if set(curve.measures) == set(measures)):
             points = max(len(run.evaluations.step) for run in curve.runs)
             line = line_of(curve.algo, own, points) | {"linestyle": curve.style}
             _draw_curve(first, learning_curve(curve.runs), line | {"label": curve.label})

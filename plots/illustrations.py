@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,11 +17,13 @@ from torch import Tensor
 
 import envs
 from algos import ALGORITHMS, saved_config
+from algos.policy import Policy, restore
 from constraints import Constraint, LinearConstraint
 from core.random import stream_seed
 from core.words import ConfigError
 from plots.paper import order_tasks
 from plots.style import plain, save
+from store.files import one_line
 from store.folder import Run, find_runs, read_run
 from store.info import missing_plugin
 
@@ -104,25 +107,28 @@ class Episode(NamedTuple):
 def play(run: Run) -> Episode:
     """The first evaluation episode of the run's seed, played with its best parameters.
 
-    Raises ConfigError if the run's algorithm or task is unknown here or its parameters are missing or of another
-    shape.
+    Raises ConfigError if the run's algorithm or task is unknown here, if its parameters are missing, damaged or of
+    another shape, and if an action is infeasible.
     """
     if run.task not in envs.TASKS or run.algo not in ALGORITHMS:
         raise ConfigError(f"{run.folder}: {run.algo} on {run.task} is not of this project{missing_plugin(run.folder)}")
     env = envs.make(run.task)
     try:
-        obs_dim = env.observation_space.shape[0]
-        agent = ALGORITHMS[run.algo].build(saved_config(run.config), env.constraint, obs_dim, [run.seed])
-        agent.load_state(0, torch.load(run.folder / "best.pt", weights_only=True))
-    except (OSError, TypeError, KeyError, RuntimeError) as error:
-        raise ConfigError(f"{run.folder / 'best.pt'}: cannot load it ({error})") from error
-    policy = agent.policy([0])
+        config = replace(saved_config(run.config), device="cpu")
+        agent = ALGORITHMS[run.algo].build(config, env.constraint, env.observation_space.shape[0], [run.seed])
+    except (TypeError, KeyError, ValueError) as error:
+        raise ConfigError(f"{run.folder} has a bad configuration: {one_line(error)}") from error
+    restore(agent, run.folder, "best")
+    policy = Policy(agent, env.constraint)
     steps, done = [], False
     env.reset(seed=stream_seed(run.seed, "evaluation"))
     obs, _ = env.reset()  # the evaluator also seeds with a separate reset
     while not done:
-        action = policy(torch.as_tensor(obs, dtype=torch.float32)[None, None])[0, 0].numpy()
-        next_obs, reward, terminated, truncated, _ = env.step(action)
+        action = policy(obs)
+        try:
+            next_obs, reward, terminated, truncated, _ = env.step(action)
+        except envs.InfeasibleActionError as error:  # the constraint has changed since the training
+            raise ConfigError(f"{run.folder}: the policy's action was refused: {error}") from error
         steps.append((obs, action, reward))
         obs, done = next_obs, terminated or truncated
     env.close()

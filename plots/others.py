@@ -26,7 +26,7 @@ import numpy as np
 
 from core.words import ConfigError
 from plots.paper import labelled
-from store.files import one_line
+from store.files import one_line, user_path
 from store.folder import Evaluations, Run, find_runs, parse_variant, read_results
 from store.published import published_cells, read_published
 
@@ -51,10 +51,10 @@ def parse_sources(words: Sequence[str]) -> list[Source]:
     """
     sources: list[Source] = []
     for word in words:
-        path, label = Path(word).expanduser(), None
+        path, label = user_path(word), None
         if "=" in word and not path.exists():  # the path of a run has a "=" itself
             text, _, label = word.rpartition("=")
-            path = Path(text).expanduser()
+            path = user_path(text)
         elif sources:
             label = path.resolve().stem if path.is_file() else path.resolve().name
         if label is not None and (label == RESERVED or not re.fullmatch(r"[^\s()]([^()]*[^\s()])?", label)):

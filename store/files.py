@@ -29,6 +29,11 @@ def replace_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
+def user_path(text: str | Path) -> Path:
+    """The path that a user means: a leading ~ is their home, ~name that of another user, if there is one."""
+    return Path(os.path.expanduser(text))  # Path.expanduser raises RuntimeError for an unknown name
+
+
 def _sync_folder(path: Path) -> None:
     try:
         folder = os.open(path, os.O_RDONLY)

@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from store.files import one_line
+from store.files import one_line, user_path
 from store.info import read_info
 
 LONGEST_NAME = 255
@@ -74,7 +74,7 @@ def run_folder(root: str | Path, task: str, variant: str, seed: int) -> Path:
     for name in (task, variant):
         if not name or name.startswith(".") or "/" in name or os.sep in name:
             raise ValueError(f"{name!r} cannot name a run's folder: empty, or with a leading '.' or a '/'")
-    return Path(root, task, variant, f"seed={seed}").expanduser()
+    return user_path(root) / task / variant / f"seed={seed}"
 
 
 def is_finished(folder: str | Path) -> bool:

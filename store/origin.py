@@ -64,6 +64,12 @@ def user_files() -> list[Path]:
     return sorted({file for module in list(sys.modules) if (file := user_file(module))})
 
 
+def project_files() -> list[Path]:
+    """The source files of all loaded modules of the project."""
+    files = {getattr(sys.modules[module], "__file__", None) for module in list(sys.modules) if is_project(module)}
+    return sorted(path for file in files if file and (path := Path(file).resolve()).is_relative_to(ROOT))
+
+
 def _user_path(file: str | None) -> Path | None:
     """The path of a source file, if it belongs to neither a library nor the commands."""
     if not file:

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from store.origin import ROOT, user_files
+from store.origin import ROOT, project_files, user_files
 
 _PACKAGES = ("numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omegaconf")
 
@@ -40,7 +40,7 @@ def describe_environment(command: Sequence[str]) -> dict[str, Any]:
         "commit": described and described.removesuffix("-dirty"),
         "dirty": described and described.endswith("-dirty"),
         "command": command_line(command),
-        "sources": _describe_sources(user_files()),
+        "sources": _describe_sources([*user_files(), *_untracked_modules()]),
         "platform": platform.platform(),
         "processor": processor(),
         "preloaded": _preloaded_libraries(),
@@ -65,6 +65,16 @@ def _preloaded_libraries() -> list[str]:
 def command_line(words: Sequence[str]) -> str:
     """The words as a shell takes them. An absolute path, alone or after `key=`, is cut to its last part."""
     return shlex.join(re.sub(r"(^|=|,)/[^,]*/(?=[^,])", r"\1", word) for word in words)
+
+
+def _untracked_modules() -> list[Path]:
+    """The source files of the project's loaded modules that the commit of this code does not have."""
+    try:
+        _git(Path(__file__), "ls-files", "--error-unmatch", Path(__file__).name)
+        tracked = _git(ROOT / "run.py", "ls-files", "--", "*.py").splitlines()
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return [file for file in project_files() if file.relative_to(ROOT).as_posix() not in tracked]
 
 
 def _describe_sources(files: Sequence[Path]) -> list[dict[str, Any]]:

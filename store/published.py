@@ -18,15 +18,17 @@ import gzip
 import io
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from store.files import replace_file
+from store.files import one_line, replace_file
 from store.folder import Evaluations, Run, parse_variant
 
 RUNS, EVALUATIONS, TRAINING = "runs.csv", "evaluations.csv.gz", "training.csv.gz"
@@ -34,6 +36,7 @@ KEY = ("algo", "variant", "seed")
 """What tells the runs of a task apart: the first columns of each file."""
 
 Key = tuple[str, str, int]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -120,40 +123,50 @@ def _training_rows(run: PublishedRun) -> list[dict[str, Any]]:
 
 
 def _read_task(folder: Path) -> list[PublishedRun]:
-    evaluations, training = _by_run(folder / EVALUATIONS), _by_run(folder / TRAINING)
+    evaluations = _by_run(folder / EVALUATIONS, _evaluations)
+    training = _by_run(folder / TRAINING, _columns)
     runs = []
     for row in _read_table(folder / RUNS):
-        key = _key(row)
-        try:
+        key = algo, variant, seed = _key(row)
+        with _named(f"{folder / RUNS}: {' '.join(map(str, key))}"):
             config, info, end = (json.loads(row[column]) for column in ("config", "info", "end"))
-        except (KeyError, ValueError) as error:
-            raise ValueError(f"{folder / RUNS}: {' '.join(map(str, key))}: {error}") from error
-        run = Run(
-            folder=folder / row["variant"] / f"seed={row['seed']}",
-            task=folder.name,
-            algo=row["algo"],
-            variant=row["variant"],
-            overrides=parse_variant(str(config.get("variant", row["variant"])))[1],
-            seed=int(row["seed"]),
-            config=config,
-            evaluations=_evaluations(evaluations.get(key, [])),
-            training=_columns(training.get(key, [])),
-            result=end if row["state"] == "finished" else None,
-            failure=end if row["state"] == "failed" else None,
-        )
+            run = Run(
+                folder=folder / variant / f"seed={seed}",
+                task=folder.name,
+                algo=algo,
+                variant=variant,
+                overrides=parse_variant(str(config.get("variant", variant)))[1],
+                seed=seed,
+                config=config,
+                evaluations=evaluations.get(key) or _evaluations([]),
+                training=training.get(key, {}),
+                result=end if row["state"] == "finished" else None,
+                failure=end if row["state"] == "failed" else None,
+            )
         runs.append(PublishedRun(run, info))
     return runs
+
+
+@contextmanager
+def _named(place: str) -> Iterator[None]:
+    """Raise what a corrupt file causes as a ValueError that names the place."""
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"{place}: no column {error.args[0]}") from error
+    except (OSError, EOFError, zlib.error, csv.Error, ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{place}: {one_line(error)}") from error
 
 
 def _key(row: Mapping[str, str]) -> Key:
     return row["algo"], row["variant"], int(row["seed"])
 
 
-def _by_run(path: Path) -> dict[Key, list[dict[str, str]]]:
-    """The rows of each run in the file `path`; no runs if there is no such file."""
-    if not path.exists():
-        return {}
-    return {key: list(rows) for key, rows in groupby(_read_table(path), _key)}
+def _by_run(path: Path, parse: Callable[[list[dict[str, str]]], T]) -> dict[Key, T]:
+    """What `parse` makes of the rows of each run in the file `path`; no runs if there is no such file."""
+    rows = _read_table(path) if path.exists() else []
+    with _named(str(path)):
+        return {key: parse(list(group)) for key, group in groupby(rows, _key)}
 
 
 def _columns(rows: Sequence[Mapping[str, str]]) -> dict[str, np.ndarray]:
@@ -173,10 +186,13 @@ def _evaluations(rows: Sequence[Mapping[str, str]]) -> Evaluations:
 
 
 def _read_table(path: Path) -> list[dict[str, str]]:
-    text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
-    rows = list(csv.DictReader(io.StringIO(text.decode(), newline="")))
-    if rows and not set(KEY) <= rows[0].keys():
-        raise ValueError(f"{path}: no column {' or '.join(set(KEY) - rows[0].keys())}")
+    with _named(str(path)):
+        text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+        rows = list(csv.DictReader(io.StringIO(text.decode(), newline="")))
+        for number, row in enumerate(rows, 1):
+            if None in row or None in row.values():
+                raise ValueError(f"row {number} has not as many fields as the header")
+            _key(row)
     return rows
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping, Sequence
 from operator import methodcaller
@@ -134,7 +135,9 @@ class RunWriter:
             raise ValueError(f"parameters are saved as 'best' or 'last', not {name!r}")
         import torch  # only here: reading results needs no torch
 
-        replace_file(self.folder / f"{name}.pt", lambda file: torch.save(dict(state_dict), file))
+        body = io.BytesIO()  # on a full disk, torch.save would hide the OSError behind one of its own
+        torch.save(dict(state_dict), body)
+        replace_file(self.folder / f"{name}.pt", lambda file: file.write(body.getbuffer()))
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Write `result.json`, which marks the run as finished. Arrays become lists of numbers."""

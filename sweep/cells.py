@@ -21,7 +21,7 @@ from algos import ALGORITHMS, PAPER, paper_settings, setting_keys
 from core.config import Config, differences, keys_that_apply, resolve, saved_settings, split_values
 from core.words import ConfigError, known_name, parse_words, split_names
 from envs import TASKS
-from store.files import replace_file
+from store.files import replace_file, user_path
 from store.folder import parse_variant, run_folder, variant_folder, variant_name
 from sweep.exit import Exit
 from sweep.plugins import load_plugins, plugin_words
@@ -94,10 +94,14 @@ class Cell(CellFolders):
     def of(cls, config: Config) -> Cell:
         """The cell that `config` describes."""
         paper = paper_config(config.algo, config.env)
+        changed = differences(config, paper)
+        for key, value in changed.items():
+            if "/" in str(value):
+                raise ConfigError(f"bad value {value!r} for {key}: it names the run's folder, which cannot have a '/'")
         return cls(
-            root=Path(config.results).expanduser(),
+            root=user_path(config.results),
             task=config.env,
-            variant=variant_folder(variant_name(config.algo, differences(config, paper))),
+            variant=variant_folder(variant_name(config.algo, changed)),
             seeds=config.seeds,
             config=config,
             paper=paper,
@@ -123,6 +127,8 @@ class Cell(CellFolders):
         config = self.config
         words = {"algo": config.algo, "env": config.env, "seed": format_seeds(self.seeds)}
         words |= parse_variant(self.full_variant)[1]
+        if config.quick:  # it changes these two, so that the paper's values differ from its own
+            words |= {"eval_episodes": str(config.eval_episodes), "final_episodes": str(config.final_episodes)}
         words |= {"results": str(self.root.absolute()), "overwrite": config.overwrite}
         words |= {"device": config.device, "threads": str(config.threads)}
         words |= {"checkpoint_every": str(config.checkpoint_every), "log": config.log}

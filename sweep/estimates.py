@@ -136,7 +136,7 @@ def correct(corrections: Mapping[tuple[str, str], float], task: str, algo: str) 
 
 def makespan(durations: Sequence[float], jobs: int) -> float:
     """When the last of `durations` ends, if `jobs` at a time start in this order."""
-    ends = [0.0] * jobs
+    ends = [0.0] * max(1, min(jobs, len(durations)))
     for duration in durations:
         heapq.heapreplace(ends, ends[0] + duration)
     return max(ends)

@@ -21,7 +21,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -38,7 +37,7 @@ from core.flow_training import DivergedError, FlowTraining
 from core.words import ConfigError
 from envs import TASKS
 from store.definition import Description
-from store.files import one_line, replace_file
+from store.files import one_line, replace_file, user_path
 from store.interrupt import Interrupted
 from store.lock import LockedError, run_lock
 from store.provenance import describe_environment
@@ -72,7 +71,7 @@ class FlowFolder:
         settings = {"version": VERSION, "flow": of_training, "task": task}
         self.settings = json.dumps(settings, indent=2, sort_keys=True) + "\n"
         digest = hashlib.sha256(self.settings.encode()).hexdigest()[:12]
-        self.path = Path(config.results).expanduser() / FOLDER / config.env / f"{flow.flow}-{digest}"
+        self.path = user_path(config.results) / FOLDER / config.env / f"{flow.flow}-{digest}"
 
     def read(self) -> dict[str, Any] | None:
         """The trained flow, None where there is none. ConfigError for a file that is damaged."""
@@ -221,6 +220,7 @@ def _reported(what: str) -> Iterator[None]:
         tqdm.write(f"{what}: {one_line(error)}", file=sys.stderr)
 
 
+@torch.no_grad()  # coefficients may be learned
 def random_play(config: Config, stop_if_asked: Callable[[], None]) -> Tensor:
     """`STATES` observations (n, k) of the task's robot under random actions, which are projected and kept for a while.
 

@@ -14,6 +14,7 @@ import envs
 from algos import Policy, load_policy
 from core.words import ConfigError, parse_words, whole_number
 from envs import ActionConstrainedEnv, InfeasibleActionError
+from store.files import user_path
 from sweep.exit import Exit
 
 USAGE = "run.py play FOLDER [episodes=3] [which=best] [video=FILE.mp4]"
@@ -32,7 +33,7 @@ def play(words: Sequence[str], stop_if_asked: Callable[[], None] = lambda: None)
         raise ConfigError(f"expected the folder of a run first ({USAGE})")
     settings = parse_words(words[1:], ("episodes", "which", "video"))
     episodes = whole_number("episodes", settings.get("episodes", "3"))
-    video = Path(settings["video"]).expanduser() if "video" in settings else None
+    video = user_path(settings["video"]) if "video" in settings else None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         policy = load_policy(words[0], settings.get("which", "best"))

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from core.words import ConfigError
-from store.files import one_line
+from store.files import one_line, user_path
 
 KEY = "plugin"
 HELP = "your own files that register tasks and algorithms, comma separated"
@@ -30,7 +30,7 @@ def load_plugins(words: Sequence[str]) -> list[str]:
     texts = value.split(",") if mine else []
     if not all(texts):
         raise ConfigError(f"bad value {value!r} for {KEY}: expected Python files (.py)")
-    paths = [Path(text).expanduser().absolute() for text in texts]
+    paths = [user_path(text).absolute() for text in texts]
     for path in paths:  # before any of them is imported
         if not path.is_file() or path.suffix != ".py":
             missing = "" if path.is_file() else ", and there is no such file"
@@ -59,7 +59,7 @@ def _load(path: Path) -> None:
         return
     name = path.stem
     spec = importlib.util.find_spec(name) if name.isidentifier() else None
-    if name in sys.modules or (spec and (not spec.origin or Path(spec.origin) != path)):
+    if name in sys.modules or (spec and (not spec.origin or Path(spec.origin).resolve() != path.resolve())):
         raise ConfigError(f"{KEY} {path} has the name of another module, {name}: rename it")
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec and spec.loader  # it has the suffix .py
@@ -80,7 +80,7 @@ def _load(path: Path) -> None:
 def _is_imported(path: Path) -> bool:
     """Whether the file is a module of this process already, as a program that is its own plugin is."""
     files = (getattr(sys.modules.get(name), "__file__", None) for name in ("__main__", path.stem))
-    return any(file and Path(file).absolute() == path for file in files)
+    return any(file and Path(file).resolve() == path.resolve() for file in files)
 
 
 def _place(error: BaseException, path: Path) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from core.config import parse_seeds
 from core.words import ConfigError
+from store.files import user_path
 from store.folder import find_runs, has_ended, read_settings
 from sweep.cells import RECORDS, CellFolders, format_seeds, shorten
 from sweep.states import NO_ANSWER, CellState, count_states, job_states, list_details, reached, state_of
@@ -37,7 +38,7 @@ def describe_status(words: Sequence[str]) -> str:
     """The table of `run.py status FOLDER`, also of `results=FOLDER`. Raises ConfigError unless it is one with cells."""
     if len(words) != 1:
         raise ConfigError(f"expected one folder of results, as in `run.py status results/`, got {len(words)}")
-    root = Path(words[0].removeprefix("results=")).expanduser()
+    root = user_path(words[0].removeprefix("results="))
     if not root.is_dir():
         raise ConfigError(f"{root} is not a folder")
     cells = find_cells(root)

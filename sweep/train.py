@@ -73,9 +73,10 @@ def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Call
     check_device(config.device)  # only here: the machine that submits a job need not have a GPU
     if config.device.startswith("cuda:"):
         torch.cuda.set_device(config.device)
+    # Adam's moments of dead units decay into denormals, which halve the speed. Threads that start later inherit this.
+    torch.set_flush_denormal(True)
     check_robot(config.env)
     check_training(config, partial(make_env, config.env, config.simulator))
-    torch.set_flush_denormal(True)  # Adam's moments of dead units decay into denormals, which halve the speed
     if config.steps <= config.learning_starts:
         print(
             f"note: steps={config.steps} is not more than learning_starts={config.learning_starts}: nothing is learned",

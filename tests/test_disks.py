@@ -4,6 +4,7 @@ import errno
 import os
 
 import pytest
+import torch
 from helpers import CHECKPOINTED, Breaks, assert_identical, break_off, outcome, run_command, train
 
 from store.checkpoint import Checkpoint, CheckpointFolder
@@ -52,7 +53,18 @@ def test_a_disk_without_room_for_a_checkpoint_does_not_end_the_training(
     assert_identical(outcome(tmp_path), unbroken)
 
 
-def test_checkpoints_that_did_not_fit_leave_the_seeds_with_a_moment_that_they_share(tmp_path, monkeypatch, unbroken):
+def test_parameters_that_do_not_fit_are_an_oserror_that_names_the_file(tmp_path, monkeypatch):
+    writer = RunWriter(tmp_path / "run", {}, {}, eval_episodes=1)
+    full = tmp_path / "run" / "best.pt.tmp"
+    full.symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left on device: '.*best.pt'"):
+        writer.save_parameters("best", {"weight": torch.zeros(100_000)})
+    assert not full.is_symlink() and not (tmp_path / "run" / "best.pt").exists()
+
+
+def test_checkpoints_that_did_not_fit_leave_the_seeds_with_a_moment_that_they_share(
+    tmp_path, monkeypatch, unbroken, capsys
+):
     """Seed 3's file fits each time, seed 5's never does."""
     first, second = break_off(tmp_path)
     fsync = os.fsync
@@ -65,12 +77,15 @@ def test_checkpoints_that_did_not_fit_leave_the_seeds_with_a_moment_that_they_sh
     before = [[path.name for path in sorted(folder.glob("checkpoint/state-*"))] for folder in (first, second)]
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
+        step = CheckpointFolder(first).read()[0][0].step
+        capsys.readouterr()
         with pytest.raises(ZeroDivisionError):
             train(
                 tmp_path,
                 CHECKPOINTED.replace("checkpoint_every=10", "checkpoint_every=2"),
                 Breaks(200, error=ZeroDivisionError()),
             )
+    assert f"ZeroDivisionError (the same command resumes from step {step})" in capsys.readouterr().err
     after = [[path.name for path in sorted(folder.glob("checkpoint/state-*"))] for folder in (first, second)]
     assert after == before
     train(tmp_path, CHECKPOINTED)

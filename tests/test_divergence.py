@@ -160,15 +160,34 @@ def test_all_seeds_may_fail(tmp_path, monkeypatch):
     assert len(failures(tmp_path)) == 3 and not list(tmp_path.rglob("checkpoint"))
 
 
-def test_a_parameter_that_no_loss_shows_is_found_before_it_is_evaluated(tmp_path, monkeypatch):
+@pytest.mark.parametrize("every", [10_000, 60], ids=["", "and a checkpoint comes first"])
+def test_a_parameter_that_no_loss_shows_is_found_before_it_is_evaluated(tmp_path, monkeypatch, every):
     def how(agent):  # minus infinity into a ReLU
         agent.actor.layers[0].bias.data[BAD, 0, 0] = -math.inf
 
     poison(monkeypatch, "DPre", how, at=79)
-    assert run_command([*f"algo=DPre env=R+N {WORDS}".split(), f"results={tmp_path}"]) == 3
+    words = f"algo=DPre env=R+N checkpoint_every={every} {WORDS}"
+    assert run_command([*words.split(), f"results={tmp_path}"]) == 3
     ((name, failure),) = failures(tmp_path).items()
     assert name == "seed=5" and failure["quantity"] == "parameter actor.layers.0.bias is not finite"
     assert failure["step"] == 120 and failure["last_evaluation"]["step"] == 60
+    (folder,) = tmp_path.glob("*/*/seed=5")
+    assert read_run(folder).evaluations.step.tolist() == [60] and failure["result"]["best_step"] == 60
+
+
+def test_a_seed_that_ends_while_another_ones_end_is_recorded_gets_its_final_evaluation(tmp_path, monkeypatch):
+    def how(agent):
+        spoil("critic", math.nan, 0)(agent)
+        agent.actor.layers[0].bias.data[BAD, 0, 0] = -math.inf
+
+    poison(monkeypatch, "DPre", how)
+    assert run_command([*f"algo=DPre env=R+N {WORDS}".split(), f"results={tmp_path}"]) == 3
+    found = failures(tmp_path)
+    assert {name: failure["quantity"] for name, failure in found.items()} == {
+        "seed=3": "critic loss is not finite",
+        "seed=5": "parameter actor.layers.0.bias is not finite",
+    }
+    assert all(failure["result"]["best_step"] == 60 for failure in found.values())
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])

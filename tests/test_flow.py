@@ -6,8 +6,9 @@ import pytest
 import torch
 
 import envs
-from algos import ALGORITHMS
+from algos import ALGORITHMS, Algorithm
 from algos.sac import SAC
+from algos.td3 import TD3
 from constraints import Ball, Box, Intersection, LinearConstraint, WeightedL1, WeightedPositivePart, check_inputs
 from core import flow_training
 from core.flow import COUPLINGS, ConditionalFlow, Flow
@@ -92,6 +93,14 @@ def test_a_flow_without_features_is_the_same_everywhere():
     assert torch.equal(flow.decode(numbers(5, 0), x)[0], flow.decode(numbers(0), x)[0])
 
 
+def test_one_action_without_features_has_one_interval():
+    flow = random_flow(1, features=0)
+    action, log_det = flow.decode(numbers(3, 0), torch.tensor([[-1.0], [0.0], [1.0]], dtype=torch.float64))
+    slope = (action[2] - action[0]) / 2.0  # an affine map
+    torch.testing.assert_close(action[1], (action[0] + action[2]) / 2.0)
+    torch.testing.assert_close(slope.log().expand(3), log_det)
+
+
 def test_a_batch_may_be_empty():
     flow = random_flow(2)
     for direction in (flow.decode, flow.encode):
@@ -169,6 +178,17 @@ def test_a_map_without_a_flow_says_so():
     with pytest.raises(RuntimeError, match="^this map has no flow yet: sweep.flows trains one"):
         Flow()(CONSTRAINT, torch.zeros(1, 3), torch.zeros(1, 2), None)
     assert Flow().state() == {}
+
+
+def test_an_agent_has_what_the_map_of_its_row_has_learned():
+    learned = flow_map()
+    row = Algorithm(TD3, learned, "layer")
+    agent = row.build(row.paper_config("DMine", "R+L2", "Others", steps=1), CONSTRAINT, 3, [0])
+    state = agent.map.state()
+    assert all(torch.equal(state[name], value) for name, value in learned.state().items())
+    agent.map.use_untrained(CONSTRAINT, torch.zeros(1, 3))
+    assert not all(torch.equal(state[name], value) for name, value in agent.map.state().items())
+    assert all(torch.equal(state[name], value) for name, value in learned.state().items())
 
 
 def test_agents_do_not_share_the_map_of_the_table():

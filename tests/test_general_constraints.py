@@ -22,6 +22,7 @@ from constraints import (
     DiagonalEllipse,
     HalfSpace,
     Intersection,
+    InUnits,
     LinearConstraint,
     PlanarEllipse,
     QuadraticConstraint,
@@ -569,6 +570,8 @@ def test_misuse():
         TypeError, match=r"an intersection is of constraints, got list; pass them one by one: Intersection\(a, b\)"
     ):
         Intersection([Box(2), Box(2)])
+    with pytest.raises(TypeError, match=r"^the constraint is an object of a constraints.Constraint, got <class"):
+        InUnits(LinearConstraint, -1.0, 1.0)
     with pytest.raises(TypeError, match=r"^an intersection is of constraints, got float$"):
         Intersection(Box(2), 0.3)
     with pytest.raises(ValueError, match="at least one"):

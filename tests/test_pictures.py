@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from helpers import refused_by_plot, run_command
 
 import envs
 import plot
 import tables
-from algos import ALGORITHMS, PAPER
+from algos import ALGORITHMS, PAPER, Algorithm
+from algos.td3 import TD3
+from core.maps import Project
 from plots import definitions, illustrations, runtime
 from store.folder import read_run
 
@@ -97,9 +100,20 @@ def test_actions_of_what_cannot_be_played(trained, tmp_path, capsys):
         capsys, "actions", copy("W+M", "SRad")
     )
     assert "Mine on R+M is not of this project" in refused_by_plot(capsys, "actions", copy("R+M", "Mine"))
-    assert "best.pt" in refused_by_plot(capsys, "actions", copy("R+M", "DRad"))
-    (copy("R+L2", "SRad") / "best.pt").unlink()
-    assert "best.pt" in refused_by_plot(capsys, "actions", tmp_path / "R+L2" / "SRad" / "seed=5")
+    assert "best.pt does not fit" in refused_by_plot(capsys, "actions", copy("R+M", "DRad"))
+    parameters = copy("R+L2", "SRad") / "best.pt"
+    parameters.write_bytes(b"")
+    assert "best.pt is damaged" in refused_by_plot(capsys, "actions", parameters.parent)
+    parameters.unlink()
+    assert "no best parameters" in refused_by_plot(capsys, "actions", parameters.parent)
+
+
+def test_actions_of_a_run_that_a_gpu_trained(trained, tmp_path):
+    folder = tmp_path / "R+M" / "SRad" / "seed=5"
+    shutil.copytree(trained, folder)
+    config = yaml.safe_load((folder / "config.yaml").read_text()) | {"device": "cuda"}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    assert plot.main(["actions", str(folder), "format=png"]) == 0
 
 
 # ---- tables of definitions ----
@@ -146,6 +160,23 @@ def test_hyperparameter_table():
     latex = tables.to_latex(table)
     assert r"\multicolumn{3}{c}{Reacher} & \multicolumn{3}{c}{Hopper} & \multicolumn{3}{c}{Others}" in latex
     assert "Setting & Meaning & TD3 & SAC & ARAM & TD3 & SAC & ARAM & TD3 & SAC & ARAM" in latex
+
+
+def test_an_algorithm_of_ones_own_with_other_values_has_columns_of_its_own(monkeypatch):
+    values = {group: settings | {"learning_rate": 0.5} for group, settings in TD3.paper.items()}
+    monkeypatch.setitem(ALGORITHMS, "DMine", Algorithm(type("Mine", (TD3,), {"paper": values}), Project(), "layer"))
+    table = definitions.hyperparameter_table()
+    rates = {(r["robot"], r["base"]): r["value"] for r in table.records if r["setting"] == "learning_rate"}
+    assert rates["Hopper", "DMine"] == 0.5 and rates["Hopper", "TD3"] == TD3.paper["Hopper"]["learning_rate"]
+    assert "Hopper DMine" in table.header and len(table.header) == 2 + 3 * 4
+
+
+def test_names_of_other_people_break_no_table():
+    cells = [tables.text_cells("a|b", r"x_1^2 \ ~ <5")]
+    table = tables.Table("name", "title", ["|", "^"], 1, [cells], [{"a": 1}])
+    assert tables.to_markdown(table).splitlines()[2:] == [r"| \| | ^ |", "| :-- | --: |", r"| a\|b | x_1^2 \ ~ <5 |"]
+    escaped = r"x\_1\textasciicircum{}2 \textbackslash{} \textasciitilde{} $<$5"
+    assert rf"a|b & {escaped} \\" in tables.to_latex(table)
 
 
 # ---- runtime ----

@@ -1,6 +1,7 @@
 """Run folders (store/folder.py), and the tables and curves made from them (plot.py, plots/)."""
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -8,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ import plot
 import tables
 from plots import figures, grouping, paper, rewards
 from store import folder as results
-from store import provenance
+from store import origin, provenance
 from store.writer import RunWriter
 
 ROOT = Path(__file__).parents[1]
@@ -236,6 +238,28 @@ def test_description_names_the_commit(tmp_path, monkeypatch):
     code.write_text("second\n")
     info = provenance.describe_environment([])
     assert info["commit"] == git("rev-parse", "HEAD") and info["dirty"] is True
+
+
+def test_description_names_a_module_of_the_project_that_the_commit_does_not_have(tmp_path, monkeypatch):
+    def git(*arguments):
+        subprocess.run(["git", "-C", str(tmp_path), *arguments], check=True, capture_output=True)
+
+    for name in ("run.py", "provenance.py", "constraints/ball.py", "constraints/mine.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    git("init")
+    git("add", "run.py", "provenance.py", "constraints/ball.py")
+    for module in (provenance, origin):
+        monkeypatch.setattr(module, "ROOT", tmp_path)
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "provenance.py"))
+    for name in ("ball", "mine"):
+        module = types.ModuleType(f"constraints.{name}")
+        module.__file__ = str(tmp_path / "constraints" / f"{name}.py")
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    sha256 = hashlib.sha256(b"constraints/mine.py").hexdigest()
+    expected = {"file": "constraints/mine.py", "sha256": sha256, "commit": None, "dirty": None}
+    assert expected in provenance.describe_environment([])["sources"]
+    assert "constraints/ball.py" not in {s["file"] for s in provenance.describe_environment([])["sources"]}
 
 
 # ---- statistics ----
@@ -555,6 +579,18 @@ def test_training_measures_side_by_side(tmp_path, monkeypatch):
     assert returns.lines[0].get_linestyle() != returns.lines[1].get_linestyle()
     assert plot.main([str(tmp_path), "format=pdf"]) == 0
     assert (tmp_path / "figures" / "R+L2-training.pdf").exists()
+
+
+def test_measures_in_another_order_share_their_panels(tmp_path, monkeypatch):
+    write_run(tmp_path, "R+L2", "SRad", 0).append_statistics(10_000, {"temperature": 0.1, "entropy": -1.0})
+    write_run(tmp_path, "R+L2", "SPre", 0).append_statistics(10_000, {"entropy": -2.0, "temperature": 0.2})
+    drawn = {}
+    monkeypatch.setattr(figures, "save", lambda figure, folder, name, formats: drawn.setdefault(name, figure) and [])
+    assert plot.main([str(tmp_path)]) == 0
+    panels = {axes.get_ylabel(): axes for axes in drawn["R+L2-training"].axes}
+    assert len(panels) == 3
+    (entropy,) = [axes for label, axes in panels.items() if "ntropy" in label]
+    assert sorted(line.get_ydata()[0] for line in entropy.lines) == [-2.0, -1.0]
 
 
 @pytest.mark.parametrize("longer", ["SRad", "DRad"])

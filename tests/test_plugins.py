@@ -66,6 +66,17 @@ def test_all_commands_take_plugins(plugin, tmp_path):
     assert python("plot.py", root, f"plugin={plugin}", "format=md").returncode == 0
 
 
+def test_a_plugin_may_be_named_through_a_link(plugin, tmp_path):
+    (tmp_path / "real").mkdir()
+    for file in (plugin, tmp_path / "my_bounds.py"):
+        file.rename(tmp_path / "real" / file.name)
+    (tmp_path / "link").symlink_to("real")
+    show = "import sys; from sweep.plugins import load_plugins; load_plugins(sys.argv[1:]); import mine; print(mine)"
+    path = os.pathsep.join([str(tmp_path / "real"), str(ROOT)])  # as a shell in that folder finds it
+    done = python("-c", show, f"plugin={tmp_path / 'link' / 'mine.py'}", env=os.environ | {"PYTHONPATH": path})
+    assert done.returncode == 0 and "mine.py" in done.stdout, done.stderr
+
+
 def test_the_processes_of_a_sweep_load_them(plugin, tmp_path):
     root = tmp_path / "results"
     words = [*CELL.replace("seed=0", "seed=0,1").split(), f"results={root}", f"plugin={plugin}", "jobs=1"]

@@ -1,5 +1,6 @@
 """Published runs: equal to their folders in every bit; what must not be published is refused."""
 
+import gzip
 import json
 import shutil
 
@@ -62,6 +63,54 @@ def test_the_same_runs_make_the_same_files(results, tmp_path):
         assert file.read_bytes() == (tmp_path / "two" / "R+L2" / file.name).read_bytes()
 
 
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def swapped(old, new):
+    def swap(path):
+        text = gzip.decompress(path.read_bytes()).decode() if path.suffix == ".gz" else path.read_text()
+        assert old in text
+        changed = text.replace(old, new, 1).encode()
+        path.write_bytes(gzip.compress(changed) if path.suffix == ".gz" else changed)
+
+    return swap
+
+
+@pytest.mark.parametrize(
+    "name, spoil",
+    [
+        ("evaluations.csv.gz", cut),
+        ("evaluations.csv.gz", lambda path: path.write_text("no gzip")),
+        (
+            "evaluations.csv.gz",
+            lambda path: path.write_bytes(path.read_bytes()[:20] + b"?????" + path.read_bytes()[25:]),
+        ),
+        ("evaluations.csv.gz", swapped("step", "stop")),
+        ("training.csv.gz", lambda path: path.write_bytes(gzip.compress(b"algo,variant,seed,step\nSRad,SRad,0,x\n"))),
+        ("runs.csv", swapped("state", "stage")),
+        ("runs.csv", swapped("DPre,DPre,0", "DPre,DPre,zero")),
+        ("runs.csv", swapped("DPre,DPre,1,", "DPre,DPre,1,,,,,")),
+        ("runs.csv", swapped(",finished,", ",finished\nDPre,DPre,7,")),
+        ("runs.csv", swapped('{""algo""', '{""algo')),
+    ],
+)
+def test_a_corrupt_file_is_named(results, tmp_path, capsys, name, spoil):
+    assert publish(results, tmp_path / "data") == 0
+    spoil(tmp_path / "data" / "R+L2" / name)
+    with pytest.raises(ValueError, match=name):
+        read_published(tmp_path / "data")
+    capsys.readouterr()
+    assert publish(results, tmp_path / "data") == 2
+    assert name in capsys.readouterr().err
+
+
+def test_a_place_that_cannot_be_written_is_one_line(results, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert publish(results, tmp_path / "file") == 2
+    assert f"publish.py: {tmp_path / 'file'}" in capsys.readouterr().err
+
+
 def test_failed_and_stopped_runs_keep_their_state(results, tmp_path):
     failed, stopped = sorted(results.glob("R+L2/DPre/seed=*"))
     (failed / "result.json").unlink()
@@ -93,6 +142,10 @@ REFUSED = {
     "its commit is not known": edited("info.json", {"commit": None}),
     "uncommitted changes": edited("info.json", {"dirty": True}),
     "uncommitted": edited("info.json", {"resumed": [{"commit": COMMIT, "dirty": True}]}),
+    "mine.py, of which no commit has that content": edited(
+        "info.json", {"sources": [{"file": "mine.py", "commit": None, "dirty": None}]}
+    ),
+    "my.py, of which": edited("info.json", {"sources": [{"file": "my.py", "commit": COMMIT, "dirty": True}]}),
     "different commits": edited("info.json", {"resumed": [{"commit": "4" * 40, "dirty": False}]}),
     "its config.yaml DPre,batch_size=7": edited("config.yaml", {"batch_size": 7}),
     "its config.yaml R+M": edited("config.yaml", {"env": "R+M"}),

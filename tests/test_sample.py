@@ -143,6 +143,16 @@ def test_dtype_and_leading_dimensions_are_those_of_the_observation():
         assert envs.constraint(name).violation(obs.unsqueeze(-2), points).max() <= 1e-6
 
 
+@pytest.mark.parametrize("rows, bounds", [([[1.0, 0.0], [-1.0, 0.0]], [0.0, 0.0]), ([[1.0], [-1.0]], [0.3, -0.3])])
+def test_a_flat_set_is_sampled_within_its_tolerance(rows, bounds):
+    rows, bounds = torch.tensor(rows, dtype=torch.float64), torch.tensor(bounds, dtype=torch.float64)
+    constraint = LinearConstraint(rows.shape[1], lambda obs: rows, lambda obs: bounds, on_empty="least")
+    points = constraint.sample(torch.zeros(1, dtype=torch.float64), 400, generator())
+    assert points.isfinite().all() and (points[..., 0] - bounds[0]).abs().max() <= 1e-6
+    if rows.shape[1] == 2:  # all along the other axis
+        assert points[..., 1].std() == pytest.approx(3**-0.5, abs=0.05)
+
+
 def test_what_has_no_uniform_points_is_refused():
     constraint = envs.constraint("R+M")
     with pytest.raises(ValueError, match="count must be at least 1, got 0"):

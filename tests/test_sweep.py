@@ -8,13 +8,17 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from helpers import assert_identical, cells_of, outcome_of, run_command
 
 import plot
-from core.config import Config, parse_seeds
+from algos import ALGORITHMS, Algorithm
+from algos.td3 import TD3, TD3Config
+from core.config import Config, parse_seeds, setting
+from core.maps import Project
 from store import slurm
 from store.checkpoint import saved_step
 from store.folder import find_runs
@@ -138,11 +142,33 @@ def test_the_words_of_a_cell_are_the_same_cell(tmp_path):
     words += " simulator=pybullet"
     cells = cells_of([*words.split(), f"results={tmp_path}", "threads=3"])
     assert len(cells) == 26
+    quick = ["algo=DPre", "env=R+N", "quick=true", f"results={tmp_path}"]
+    cells += cells_of([*quick, "eval_episodes=5", "final_episodes=50"]) + cells_of([*quick, "final_episodes=1"])
     for cell in cells:
         (same,) = cells_of(cell.words)
         pickled = pickle.loads(pickle.dumps(cell))
         for other in (same, pickled):
             assert (other, other.config, other.paper) == (cell, cell.config, cell.paper)
+
+
+@dataclass
+class TextConfig(TD3Config):
+    source: str = setting("none", "a text")
+
+
+def test_a_text_that_cannot_name_a_folder_is_refused(tmp_path, monkeypatch, capsys):
+    mine = type("Mine", (TD3,), {"config_class": TextConfig})
+    monkeypatch.setitem(ALGORITHMS, "DMine", Algorithm(mine, Project(), "layer"))
+    assert run_command(["algo=DMine", "env=R+N", "source=data/a.csv", f"results={tmp_path}"]) == 2
+    assert "bad value 'data/a.csv' for source: it names the run's folder" in capsys.readouterr().err
+
+
+def test_a_folder_of_a_user_that_nobody_knows_is_a_name_like_any_other(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run_command(["status", "~no-such-user"]) == 2
+    assert "~no-such-user is not a folder" in capsys.readouterr().err
+    (cell,) = cells_of(["algo=DPre", "env=R+N", "results=~/results"])
+    assert cell.root == Path.home() / "results"
 
 
 # ---------------------------------------------------------------- plans and estimates

@@ -44,8 +44,10 @@ class NFWPO(TD3):
 
     def reference_action(self, obs: Tensor, suggested: Tensor) -> Tensor:
         """a_s = P_s(mu(s) + alpha (c_s - P_s(mu(s)))), c_s = argmax over the set of <c, grad_a Q_1(s, P_s(mu(s)))>."""
-        projected = self.constraint.project(obs, suggested).requires_grad_()
-        (gradient,) = torch.autograd.grad(self.critic.first(obs, projected).sum(), projected)
-        vertex = self.constraint.linear_oracle(obs, gradient)
-        step = self.config.fw_learning_rate * (vertex - projected.detach())
-        return self.constraint.project(obs, suggested + step)
+        with torch.no_grad():  # coefficients of the set may be learned
+            projected = self.constraint.project(obs, suggested)
+        (gradient,) = torch.autograd.grad(self.critic.first(obs, projected.requires_grad_()).sum(), projected)
+        with torch.no_grad():
+            vertex = self.constraint.linear_oracle(obs, gradient)
+            step = self.config.fw_learning_rate * (vertex - projected)
+            return self.constraint.project(obs, suggested + step)

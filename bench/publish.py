@@ -139,7 +139,7 @@ def main(argv: Sequence[str]) -> int:
         out = user_path(words.get("out", OUT))
         published, refused = publish(root, out, tasks, algos, "settings" in words)
     except (OSError, ValueError) as error:  # a ConfigError is a ValueError
-        where = f"{error.filename}: " if isinstance(error, OSError) else ""
+        where = f"{error.filename}: " if isinstance(error, OSError) and error.filename else ""
         print(f"publish.py: {where}{one_line(error)}", file=sys.stderr)
         return 2
     for line in published or ["nothing new to publish"]:

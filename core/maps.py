@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Literal, NamedTuple
 
 from torch import Tensor
@@ -71,10 +71,10 @@ class Map(ABC):
 
     def configured(self, config: Config) -> Map:
         """A copy of the map with the settings that `config` has of its fields."""
-        mine = copy.deepcopy(self)  # with what it has learned, and nothing that it learns later is the table's
-        for f in fields(self):
-            setattr(mine, f.name, getattr(config, f.name, getattr(self, f.name)))
-        return mine
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed = {name: getattr(config, name) for name in own if getattr(config, name, own[name]) != own[name]}
+        # With its own settings, it keeps what it has learned. With others, it is made anew.
+        return replace(self, **changed) if changed else copy.deepcopy(self)
 
     def propose(self, constraint: Constraint, obs: Tensor, suggested: Tensor) -> Tensor:
         """The action (..., d) before it is made feasible, whose violation training.csv has: the suggestion itself."""

@@ -27,7 +27,7 @@ class Moments:
         self.seeds, self.agent, self.replay = seeds, agent, replay
         self.evaluator, self.timer = evaluator, timer
         self.step: int | None = None
-        """The least step in the last moment of a seed that had not ended; None without one."""
+        """The least step of a seed in the last moment, without those that had ended before; None before the first."""
 
     def write(self, obs: Tensor, center: Tensor | None) -> None:
         """Write a checkpoint of every seed; obs (seeds, n) and `center` (seeds, d) are the present ones.
@@ -70,7 +70,8 @@ class Moments:
         self._count()
 
     def _count(self) -> None:
-        self.step = min((seed.steps for seed in self.seeds if not seed.ended), default=None)
+        steps = [seed.steps for seed in self.seeds if not seed.ended] or [max(seed.steps for seed in self.seeds)]
+        self.step = min(steps)
 
     def _state(self, seed: Seed, obs: Tensor, center: Tensor | None) -> dict[str, Any]:
         """Everything about a seed but its transitions."""

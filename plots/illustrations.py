@@ -18,7 +18,7 @@ from torch import Tensor
 import envs
 from algos import ALGORITHMS, saved_config
 from algos.policy import Policy, restore
-from constraints import Constraint, LinearConstraint
+from constraints import Constraint, ConstraintError, LinearConstraint
 from core.random import stream_seed
 from core.words import ConfigError
 from plots.paper import order_tasks
@@ -42,6 +42,7 @@ def polygon() -> LinearConstraint:
     return LinearConstraint(2, A=lambda obs: A, b=lambda obs: b)
 
 
+@torch.no_grad()  # coefficients may be learned
 def boundary(constraint: Constraint, obs: Tensor) -> np.ndarray:
     """Points (1440, 2) around the boundary of a set of two dimensions at obs (n,), from its gauge."""
     angles = torch.linspace(0.0, 2.0 * math.pi, 1441, dtype=torch.float64)[:-1]
@@ -108,7 +109,7 @@ def play(run: Run) -> Episode:
     """The first evaluation episode of the run's seed, played with its best parameters.
 
     Raises ConfigError if the run's algorithm or task is unknown here, if its parameters are missing, damaged or of
-    another shape, and if an action is infeasible.
+    another shape, and if an action is refused or the constraint breaks down.
     """
     if run.task not in envs.TASKS or run.algo not in ALGORITHMS:
         raise ConfigError(f"{run.folder}: {run.algo} on {run.task} is not of this project{missing_plugin(run.folder)}")
@@ -120,21 +121,23 @@ def play(run: Run) -> Episode:
         raise ConfigError(f"{run.folder} has a bad configuration: {one_line(error)}") from error
     restore(agent, run.folder, "best")
     policy = Policy(agent, env.constraint)
-    steps, done = [], False
+    steps: list[tuple[np.ndarray, np.ndarray, float]] = []
+    done = False
     env.reset(seed=stream_seed(run.seed, "evaluation"))
     obs, _ = env.reset()  # the evaluator also seeds with a separate reset
     while not done:
-        action = policy(obs)
         try:
+            action = policy(obs)
             next_obs, reward, terminated, truncated, _ = env.step(action)
-        except envs.InfeasibleActionError as error:  # the constraint has changed since the training
-            raise ConfigError(f"{run.folder}: the policy's action was refused: {error}") from error
+        except (envs.InfeasibleActionError, ConstraintError) as error:
+            raise ConfigError(f"{run.folder}: the episode ends at step {len(steps) + 1}: {error}") from error
         steps.append((obs, action, reward))
         obs, done = next_obs, terminated or truncated
     env.close()
     return Episode(*(np.stack(column) for column in zip(*steps, strict=True)))
 
 
+@torch.no_grad()
 def draw_actions(folder: Path, out: Path, formats: Sequence[str]) -> list[Path]:
     """Feasible set and executed action at moments of an episode, and how far out the actions are throughout.
 

@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from store.origin import is_project
+
 
 def read_info(folder: str | Path) -> dict[str, Any]:
     """The content of info.json in the folder of a run; empty if it cannot be read."""
@@ -22,7 +24,8 @@ def missing_plugin(folder: str | Path) -> str:
     Empty where the run used no file of the user's own.
     """
     try:
-        names = ",".join(source["file"] for source in read_info(folder).get("sources", []))
+        files = [source["file"] for source in read_info(folder).get("sources", [])]
+        names = ",".join(file for file in files if not is_project(Path(file).parts[0]))
     except (KeyError, TypeError):
         return ""
     return f"; its run used {names}: add plugin={names}" if names else ""

@@ -66,8 +66,9 @@ def user_files() -> list[Path]:
 
 def project_files() -> list[Path]:
     """The source files of all loaded modules of the project."""
-    files = {getattr(sys.modules[module], "__file__", None) for module in list(sys.modules) if is_project(module)}
-    return sorted(path for file in files if file and (path := Path(file).resolve()).is_relative_to(ROOT))
+    paths = [ROOT.joinpath(*module.split(".")) for module in list(sys.modules) if is_project(module)]
+    files = [file for path in paths for file in (path.with_suffix(".py"), path / "__init__.py")]
+    return sorted(file for file in files if file.is_file())
 
 
 def _user_path(file: str | None) -> Path | None:

@@ -23,7 +23,7 @@ _PACKAGES = ("numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omegaconf")
 
 
 def describe_environment(command: Sequence[str]) -> dict[str, Any]:
-    """The content of `info.json`: versions, git commit, command, machine, start time, and the user's loaded sources.
+    """The content of `info.json`: versions, commit, command, machine, start time, and sources that the commit lacks.
 
     It names no path of this machine.
     """

@@ -62,6 +62,16 @@ def test_parameters_that_do_not_fit_are_an_oserror_that_names_the_file(tmp_path,
     assert not full.is_symlink() and not (tmp_path / "run" / "best.pt").exists()
 
 
+def test_an_error_after_the_last_step_names_the_checkpoint_too(tmp_path, monkeypatch, capsys, unbroken):
+    with monkeypatch.context() as patch:
+        patch.setattr(RunWriter, "finish", no_space)
+        with pytest.raises(OSError, match="No space"):
+            train(tmp_path, CHECKPOINTED)
+    assert "OSError (the same command resumes from step " in capsys.readouterr().err
+    train(tmp_path, CHECKPOINTED)
+    assert_identical(outcome(tmp_path), unbroken)
+
+
 def test_checkpoints_that_did_not_fit_leave_the_seeds_with_a_moment_that_they_share(
     tmp_path, monkeypatch, unbroken, capsys
 ):

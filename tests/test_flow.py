@@ -1,6 +1,8 @@
 """The flow of DFlow and SFlow: a bijection with an exact density, its training, and the map that it makes."""
 
 import math
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,9 +13,10 @@ from algos.sac import SAC
 from algos.td3 import TD3
 from constraints import Ball, Box, Intersection, LinearConstraint, WeightedL1, WeightedPositivePart, check_inputs
 from core import flow_training
+from core.config import setting
 from core.flow import COUPLINGS, ConditionalFlow, Flow
 from core.flow_training import DivergedError, FlowTraining
-from core.maps import Sample
+from core.maps import Project, Sample
 
 CONSTRAINT = WeightedPositivePart(lambda obs: 2.0 * obs[..., :2] + 3.0, 0.8, 2)
 
@@ -189,6 +192,21 @@ def test_an_agent_has_what_the_map_of_its_row_has_learned():
     agent.map.use_untrained(CONSTRAINT, torch.zeros(1, 3))
     assert not all(torch.equal(state[name], value) for name, value in agent.map.state().items())
     assert all(torch.equal(state[name], value) for name, value in learned.state().items())
+
+
+def test_a_map_with_other_settings_is_made_anew():
+    @dataclass
+    class Strong(Project):
+        strength: float = setting(1.0, "how strong")
+
+        def __post_init__(self):
+            self.twice = 2 * self.strength
+
+    row = Strong()
+    for config, twice in ((SimpleNamespace(strength=3.0), 6.0), (SimpleNamespace(), 2.0)):
+        assert row.configured(config).twice == twice and row.configured(config) is not row
+    wider = SimpleNamespace(flow_width=16)
+    assert flow_map().configured(wider).state() == {}
 
 
 def test_agents_do_not_share_the_map_of_the_table():

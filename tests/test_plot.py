@@ -251,6 +251,7 @@ def test_description_names_a_module_of_the_project_that_the_commit_does_not_have
     git("add", "run.py", "provenance.py", "constraints/ball.py")
     for module in (provenance, origin):
         monkeypatch.setattr(module, "ROOT", tmp_path)
+    monkeypatch.setattr(origin, "_commands", set)  # a cached function, which keeps what it has seen
     monkeypatch.setattr(provenance, "__file__", str(tmp_path / "provenance.py"))
     for name in ("ball", "mine"):
         module = types.ModuleType(f"constraints.{name}")

@@ -57,7 +57,7 @@ class PyBulletReacher(SimulatedRobot):
         client = bullet.connect(bullet.DIRECT)
         if client < 0:
             raise RuntimeError("PyBullet could not start another physics client in this process")
-        # called once: by close(), when the robot goes, or when the process ends
+        # called once: by close(), when the robot is deleted, or when the process ends
         self._disconnect = weakref.finalize(self, bullet.disconnect, client)
         self._own_client = client
         bodies = bullet.loadMJCF(

@@ -3,8 +3,8 @@
 - On rows alone: a dual active-set method, exact to rounding. It is faster than a loop over OSQP, and stays exact for
   points far away, where OSQP stops converging.
 - With ellipses: Newton's method, which finds the active constraints of most samples. If it fails, an interior-point
-method finds them, and Newton's method runs again, exact to rounding. If that fails too, sequential quadratic
-programming with the active-set method starts from the deepest point.
+  method finds them, and Newton's method runs again, exact to rounding. If that fails too, sequential quadratic
+  programming with the active-set method starts from the deepest point.
 """
 
 from __future__ import annotations
@@ -67,8 +67,7 @@ def optimal_points(sets: ScaledSets, aim: Tensor, linear: bool) -> tuple[Tensor,
     solution, exact, done = _newton(sets, target, point, multipliers)
     left = (~done).nonzero().squeeze(-1)
     if len(left) > 0:
-        # Start from the deepest point, because a start near the boundary may be the cause. Raises if there is no
-        # interior.
+        # Start from the deepest point, as a start near the boundary may be the cause. This needs an interior.
         part = sets[left]
         inside = deepest_points(part)
         target, point, multipliers = _near_optimum(part, aim[left], linear, inside)

@@ -3,14 +3,14 @@
     python plot.py results/          all runs of a folder of results or of published data (docs/data), finished or not:
                                        tables/rewards       mean and standard error of the finished runs
                                        tables/comparison    the same beside the paper's table
-                                       tables/adjusted      Reacher: without the luck of the starts
+                                       tables/adjusted      Reacher's returns without the luck of the starts
                                        tables/aggregate     interquartile mean over tasks, with intervals
                                        tables/improvement   probability that one algorithm is better than another
                                        figures/<task>       learning curves, also of runs in progress
                                        figures/<task>-training   return and training measures, all settings
                                        figures/aggregate, figures/improvement
-    python plot.py results/ OTHER/=label ...   the same with the runs of other folders, or of CSV files with the columns
-                                     task,algorithm,seed,step,return, beside them, as "SRad (label)"
+    python plot.py results/ OTHER/=label ...   the same, with the runs of other folders or of CSV files (columns
+                                     task,algorithm,seed,step,return) beside them, as "SRad (label)"
     python plot.py tables            tables/tasks and tables/hyperparameters, from the code's definitions
     python plot.py maps              figures/maps: the three feasibility maps, the paper's Figure 1
     python plot.py actions RUN       figures/actions-...: feasible set and executed actions over an episode with

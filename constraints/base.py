@@ -161,8 +161,8 @@ class Constraint(ABC):
     def penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         """Penalty (...) of the '+' algorithms on an action in the box (paper, "Algorithms").
 
-        It is the norm of max(Ax - b, 0) with unit rows, max(sqrt(x'Qx) - sqrt(b), 0) with tr Q = dim, and the sum
-        where both are present.
+        It is the norm of max(Ax - b, 0) with unit rows, max(sqrt(x'Qx) - sqrt(b), 0) with tr Q = dim, and the sum if
+        both are present.
         """
         obs64, action64 = self._broadcast(obs, action)
         return self._penalty(self._at(obs64), action64).to(action.dtype)

@@ -116,12 +116,12 @@ def minimize_under_ellipse(
     """Minimiser of sum(shift a^2 / 2 - target a) over the problem's set and sum(scale a^2) <= bound.
 
     scale (..., d) >= 0, target >= 0. The minimiser is the problem's solution for the metric shift + mu scale. Returns
-    the minimiser (..., d), that solution, which has the active constraints, and the ellipse's multiplier mu (..., 1), 0
-    where the ellipse is not active.
+    the minimiser (..., d), that solution with the active constraints, and the ellipse's multiplier mu (..., 1), 0 if
+    the ellipse is not active.
 
-    The dual function is concave in mu, so the ellipse's value falls with mu. Newton's method finds where it equals the
-    bound, within a bracket, by way of 1 / sqrt(value of the free coordinates), which is linear in mu for a sphere.
-    Since scale_i a_i <= target_i / mu, the multiplier is at most |target|_1 / bound.
+    The dual function is concave in mu, so the ellipse's value falls with mu. Within a bracket, Newton's method finds
+    the mu at which it equals the bound. It solves for 1 / sqrt(value of the free coordinates), which is linear in mu
+    for a sphere. Since scale_i a_i <= target_i / mu, the multiplier is at most |target|_1 / bound.
     """
     target = problem.target
     high = target.sum(-1, keepdim=True) / bound

@@ -45,7 +45,7 @@ def make(
     show_set: bool = False,
     dtype: Any = np.float64,
 ) -> ActionConstrainedEnv:
-    """The environment of `task` (a key of `TASKS`, as "W+M"); see `ActionConstrainedEnv`.
+    """The environment of `task` (a key of `TASKS`, such as "W+M"); see `ActionConstrainedEnv`.
 
     An infeasible action raises `InfeasibleActionError`. With `project` it is projected instead, so that any Gymnasium
     agent can train as the paper's DPre does. `simulator="pybullet"` runs Reacher on PyBullet, if that is installed.

@@ -118,9 +118,9 @@ class ActionConstrainedEnv(gymnasium.Env):
     original does. After the end of an episode, step() raises gymnasium.error.ResetNeeded. After close(), reset(),
     step() and render() raise gymnasium.error.ClosedEnvironmentError.
 
-    Attributes: `constraint`; `largest_violation` (float) over all executed actions since construction, -inf
-    before the first; `executed_actions` (int), their number; `elapsed_steps` (int) of the current episode;
-    `max_episode_steps` (int, None for no limit), the robot's or what `gymnasium.make` was given.
+    Attributes: `constraint`; `largest_violation` (float) over all executed actions since construction, -inf before the
+    first; `executed_actions` (int), their number; `elapsed_steps` (int) of the current episode; `max_episode_steps`
+    (int, None for no limit), the robot's or the one given to `gymnasium.make`.
     """
 
     metadata = {"render_modes": ["rgb_array"]}

@@ -149,7 +149,7 @@ class _Locomotion(SimulatedRobot):
     def render(self, width: int = 480, height: int = 480) -> np.ndarray:
         """Picture (height, width, 3), uint8, from the side, the camera following the robot.
 
-        Raises RuntimeError where no OpenGL backend works.
+        Raises RuntimeError if no OpenGL backend works.
         """
         if self._picture is None:
             self._picture = _Picture(self._mujoco, self.model, width, height)

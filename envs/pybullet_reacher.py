@@ -36,7 +36,7 @@ def _silent_import() -> Iterator[None]:
 class PyBulletReacher(SimulatedRobot):
     """One arm in a physics client of its own; observations and actions are those of `Reacher`.
 
-    Raises UnavailableError where PyBullet is not installed.
+    Raises UnavailableError if PyBullet is not installed.
     """
 
     obs_dim, action_dim = Reacher.obs_dim, Reacher.action_dim

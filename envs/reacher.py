@@ -82,7 +82,8 @@ class Arithmetic(NamedTuple):
 def _accelerate(
     half_cos: Value, half_sin: Value, w1: Value, w2: Value, t1: Value, t2: Value, root: Callable[[Value], Value]
 ) -> tuple[Value, ...]:
-    """Joint accelerations, and what an impulse on joint 1 needs: (a1, a2, 1 / inertia at joint 0, rx, c).
+    """Joint accelerations, and the quantities that an impulse on joint 1 needs: (a1, a2, 1 / inertia at joint 0, rx,
+    c).
 
     `half_cos` and `half_sin` belong to half the angle of joint 1, `w1`, `w2` are joint speeds, `t1`, `t2` torques.
     Floats and arrays take the same operations in the same order, and so give the same bits. All vectors are in the
@@ -226,7 +227,7 @@ class State(NamedTuple):
     seen_y: Any
 
     def fingertip(self, arithmetic: Arithmetic) -> tuple[Any, Any]:
-        """Where the fingertip is."""
+        """Position (x, y) of the fingertip, without the delay."""
         cos, sin, total = arithmetic.cos, arithmetic.sin, self.q1 + self.q2
         return _UPPER * cos(self.q1) + _FORE * cos(total), _UPPER * sin(self.q1) + _FORE * sin(total)
 

@@ -45,7 +45,7 @@ class Robot(ABC):
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         if "simulators" not in vars(cls):
-            cls.simulators = {}  # those of the base class would run the base class
+            cls.simulators = {}  # the base class's entries would run the base class
         if "step" in vars(cls) and "step_together" not in vars(cls):
             # The inherited step_together would take the base class's step.
             cls.step_together = classmethod(Robot.step_together.__func__)  # type: ignore[assignment, attr-defined]

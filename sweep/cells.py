@@ -68,8 +68,7 @@ class CellFolders:
 
     @property
     def job(self) -> str:
-        """The cell's last Slurm job and its cluster, because job numbers repeat across clusters; empty without a
-        job."""
+        """The cell's last Slurm job and its cluster, as job numbers repeat across clusters; empty without one."""
         record = self.read("job")
         return f"{record['job']} of cluster {record['cluster']}" if record.get("cluster") else record.get("job", "")
 

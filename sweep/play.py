@@ -101,7 +101,7 @@ def _picture(env: ActionConstrainedEnv) -> np.ndarray:
 def new_video(path: Path, fps: int) -> Iterator[Film]:
     """A new video file `path` (.mp4) with `fps` pictures a second, all of the size of the first one.
 
-    Raises ConfigError where the file exists already, for another suffix, and without imageio-ffmpeg. An error while the
+    Raises ConfigError if the file exists already, for another suffix, and without imageio-ffmpeg. An error while the
     video is open deletes the file.
     """
     try:

@@ -18,7 +18,7 @@ SIGNAL_DELAY = 120
 
 @dataclass
 class SlurmSettings:
-    """What each job of a sweep asks Slurm for."""
+    """The resources that each job of a sweep requests from Slurm."""
 
     partition: str | None = field(default=None, metadata={"help": "partition (default: the cluster's)"})
     gpus: int = field(default=0, metadata={"help": "GPUs a cell"})

@@ -61,7 +61,7 @@ def train_cells(cells: Sequence[Cell], stop_if_asked: Callable[[], None] = lambd
 
 
 def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Callable[[], None] = lambda: None) -> bool:
-    """Train the seeds of one cell that have not ended, from their checkpoints where there are any.
+    """Train the seeds of one cell that have not ended, from their checkpoints if there are any.
 
     `definition` comes from `sweep.definition.define`. Prints each result and its folder. Returns whether every seed has
     a result.

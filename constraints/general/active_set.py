@@ -35,8 +35,8 @@ def project_on_rows(
     sample = torch.arange(count, device=rows.device)
     point, limits = target.clone(), bounds.clone()
     normals = rows.new_zeros(count, dim, dim)  # (sample, slot, coordinate)
-    # normals = triangle' @ basis, where the rows of the basis are orthonormal. Kept is the inverse of the upper
-    # triangle. Unused slots are 0.
+    # normals = triangle' @ basis, where the rows of the basis are orthonormal. Only the inverse of the upper triangle
+    # is stored. Unused slots are 0.
     basis, inverse = torch.zeros_like(normals), torch.zeros_like(normals)
     index = torch.full((count, dim), -1, device=rows.device)
     weight = rows.new_zeros(count, dim)

@@ -99,7 +99,7 @@ def _minimize_quadratic(sets: ScaledSets, start: Tensor, curvature: Tensor, grad
     zero = torch.zeros_like(start)
     curvature = curvature / size
     point, dual, _ = solve_cone_programs(curvature, gradient, sets.rows, bounds, matrix, offset, zero, _ACCURACY)
-    # In units of a. An ellipse bounds the square of what its cone bounds, hence half.
+    # Back to units of a. An ellipse bounds the square of what its cone bounds, hence half.
     m = sets.rows.shape[1]
     return start + point / size, torch.cat((dual[:, :m], 0.5 * dual[:, m:] / size), -1)
 

@@ -136,8 +136,7 @@ class _Check:
             self.fail(f".{method}() returns an observation that is not finite: {obs}")
 
     def play(self, machine: Robot, actions: Sequence[np.ndarray], spoil: bool = False) -> list[Step]:
-        """Step `machine` until the episode terminates; with `spoil`, overwrite the arrays that it returned and was
-        given."""
+        """Step `machine` until the episode terminates; with `spoil`, overwrite the arrays given and returned."""
         steps: list[Step] = []
         for action in actions:
             given = action.copy()

@@ -82,8 +82,7 @@ class Arithmetic(NamedTuple):
 def _accelerate(
     half_cos: Value, half_sin: Value, w1: Value, w2: Value, t1: Value, t2: Value, root: Callable[[Value], Value]
 ) -> tuple[Value, ...]:
-    """Joint accelerations, and the quantities that an impulse on joint 1 needs: (a1, a2, 1 / inertia at joint 0, rx,
-    c).
+    """Joint accelerations, and the values that an impulse on joint 1 needs: (a1, a2, 1 / inertia at joint 0, rx, c).
 
     `half_cos` and `half_sin` belong to half the angle of joint 1, `w1`, `w2` are joint speeds, `t1`, `t2` torques.
     Floats and arrays take the same operations in the same order, and so give the same bits. All vectors are in the

@@ -20,10 +20,9 @@ _RANK = 1e-7
 def projection_jacobian(sets: ScaledSets, solution: Tensor, hessian: Tensor, multipliers: Tensor) -> Tensor:
     """Jacobian (n, d, d) of the projection with respect to the target: the inverse Hessian on the free subspace.
 
-    The free subspace is what the active constraints leave. An active constraint with multiplier 0 is a kink and does
-    not
-    count, with one exception: if such constraints block each other within the subspace that the others leave, as at the
-    apex of a pyramid, they all count.
+    The free subspace is orthogonal to the normals of the active constraints. An active constraint with multiplier 0 is
+    a kink and does not count, with one exception: if such constraints block each other within the subspace that the
+    others leave, as at the apex of a pyramid, they all count.
     """
     return _on_free_space(_free_space(sets, solution, multipliers)[0], hessian)
 

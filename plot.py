@@ -3,14 +3,14 @@
     python plot.py results/          all runs of a folder of results or of published data (docs/data), finished or not:
                                        tables/rewards       mean and standard error of the finished runs
                                        tables/comparison    the same beside the paper's table
-                                       tables/adjusted      Reacher: without the luck of the starts
+                                       tables/adjusted      Reacher's returns without the luck of the starts
                                        tables/aggregate     interquartile mean over tasks, with intervals
                                        tables/improvement   probability that one algorithm is better than another
                                        figures/<task>       learning curves, also of runs in progress
                                        figures/<task>-training   return and training measures, all settings
                                        figures/aggregate, figures/improvement
-    python plot.py results/ OTHER/=label ...   the same with the runs of other folders, or of CSV files with the columns
-                                     task,algorithm,seed,step,return, beside them, as "SRad (label)"
+    python plot.py results/ OTHER/=label ...   the same, with the runs of other folders or of CSV files (columns
+                                     task,algorithm,seed,step,return) beside them, as "SRad (label)"
     python plot.py tables            tables/tasks and tables/hyperparameters, from the code's definitions
     python plot.py maps              figures/maps: the three feasibility maps, the paper's Figure 1
     python plot.py actions RUN       figures/actions-...: feasible set and executed actions over an episode with
@@ -97,7 +97,7 @@ def _read(sources: Sequence[Source], options: dict[str, str]) -> Groups:
         found += cells_in(root)
     places = " ".join(str(source.path) for source in sources)
     tasks_there, algos_there = ({names[i] for names in found} for i in range(2))
-    # The folder gives the choices, so that a new task or algorithm needs no entry here.
+    # The choices come from the folder, so a new task or algorithm needs no entry here.
     tasks = split_names(f"env in {places}", options.get("env", "all"), order_tasks(tasks_there))
     algos = order_algos(algos_there)
     of_paper = {"paper": [algo for algo in algos if algo in COLORS]}
@@ -118,11 +118,11 @@ def _read(sources: Sequence[Source], options: dict[str, str]) -> Groups:
     return groups
 
 
-# What follows imports late, because PyTorch and the simulators take seconds to load.
+# The functions below import late, because PyTorch and the simulators take seconds to load.
 
 
 def _tables_of_reacher(groups: Groups) -> list[tables.Table]:
-    """The table of returns without the luck of their starts, where there are runs on Reacher."""
+    """The table of Reacher's returns without the luck of the starts; an empty list without runs on Reacher."""
     if not any(condition.task.startswith("R+") for condition in groups):
         return []
     from plots.starts import adjusted_table
@@ -194,7 +194,7 @@ COMMANDS = {"tables": plot_tables, "maps": plot_maps, "actions": plot_actions, "
 
 
 def run(arguments: Sequence[str]) -> list[Path]:
-    """Carry out the command line. Returns the files written."""
+    """Run the command line. Returns the files written."""
     words, options = parse_arguments(load_plugins(arguments))
     if not words or words[0] not in COMMANDS:
         return plot_results(words, options)
@@ -205,7 +205,7 @@ def run(arguments: Sequence[str]) -> list[Path]:
 
 
 NAMED = 4
-"""The most files of a folder that the last lines name."""
+"""The last lines name the files of a folder if it has at most this many."""
 
 
 def main(arguments: Sequence[str]) -> int:

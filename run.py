@@ -48,7 +48,7 @@ def usage() -> str:
 
 
 def carry_out(arguments: Sequence[str], stop_if_asked: Callable[[], None]) -> Exit:
-    """Train what the arguments ask for. `stop_if_asked` raises Interrupted once a signal has asked for the end."""
+    """Train what the arguments ask for. `stop_if_asked` raises Interrupted after a signal to stop."""
     sweep, settings = parse_sweep(load_plugins(arguments))
     cells = make_cells(settings)
     if sweep.wanted:

@@ -22,7 +22,7 @@ class TableCell(NamedTuple):
     bold: bool = False
     missing: bool = False
     merge: bool = False
-    """LaTeX draws equal neighbours of this kind as one."""
+    """LaTeX merges equal neighbours of this kind into one cell."""
     tex: str | None = None
     """LaTeX of the first line, if it differs from the text."""
 
@@ -39,7 +39,7 @@ class Table:
     records: list[dict[str, Any]]
     """The same content in full precision for CSV: one record for each cell or row."""
     spans: dict[str, int] = field(default_factory=dict)
-    """LaTeX headings above several columns each, with their number, from the first column after the labels."""
+    """LaTeX headings above several columns: heading -> number of columns, from the first column after the labels."""
 
 
 def text_cells(*texts: str) -> list[TableCell]:
@@ -154,7 +154,7 @@ _ESCAPED = {character: f"\\{character}" for character in "&%$#_{}"} | {
     "<": "$<$",
     ">": "$>$",
 }
-"""What LaTeX reads as commands in a text."""
+"""Characters that LaTeX reads as commands, with their replacements."""
 
 
 def _escape(text: str) -> str:

@@ -1,4 +1,4 @@
-"""A ball (R+L2). Inside the box everything is a closed form; only the box alone is cheaper."""
+"""A ball (R+L2). Inside the box, all of its methods are closed forms; only the box alone is cheaper."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from constraints.sample import uniform_in_ball
 
 
 class _InBox(NamedTuple):
-    """The ball alone: there is nothing that depends on the observation."""
+    """A ball inside the box, whose bound does not depend on the observation."""
 
     bound: float
 
@@ -23,8 +23,8 @@ class _InBox(NamedTuple):
 class Ball(DiagonalEllipse):
     """sum a_i^2 <= bound in the box; the bound is a number or a function of obs.
 
-    A number up to 1 keeps the ball inside the box: every method is then one formula, and the box is left out. For
-    others it is a DiagonalEllipse. ValueError for a number that is not positive.
+    With a number up to 1, the ball lies inside the box: every method is then one formula that ignores the box. With any
+    other bound, the class works as a DiagonalEllipse. ValueError for a number that is not positive and finite.
     """
 
     def __init__(self, bound: Bound, dim: int):
@@ -40,7 +40,7 @@ class Ball(DiagonalEllipse):
     def _violation(self, at: Any, action: Tensor) -> Tensor:
         if self._in_box is None:
             return super()._violation(at, action)
-        return action.norm(dim=-1) - at.bound**0.5  # the trace of the identity is dim already
+        return action.norm(dim=-1) - at.bound**0.5  # the trace of Q = I is dim already
 
     def _project(self, at: Any, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         if self._in_box is None:

@@ -3,11 +3,11 @@
 A feasible set is `A(obs)`, convex, inside the action box [-1, 1]^d. Tensors may have any leading dimensions; those of
 `obs (..., n)` and `action (..., d)` broadcast against each other. Inputs are float32 or float64 and results have the
 dtype of the action. The mathematics is float64 throughout: joint velocities reach 1e6, and feasibility holds to 1e-6.
-That costs little, because the time goes into the number of operations and not into their width.
+That costs little, because the time depends on the number of operations and not on their precision.
 
 Gradients with respect to the action are closed forms. Gradients with respect to the observation, a centre and the
-parameters of learned coefficients exist as well; they take more time, and only where a tensor asks for them. Pass
-`obs.detach()` where they are not wanted.
+parameters of learned coefficients exist as well. They cost more time and are computed only if one of these tensors
+requires gradients. Pass `obs.detach()` to avoid them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from constraints.sample import hit_and_run
 OnEmpty = Literal["error", "least"]
 
 AT_FACE = 1.0 - 1e-9
-"""The box holds a coordinate of a projection that is at least this large: rounding may have moved it off the face."""
+"""The box holds a coordinate of a projection from this absolute value on: rounding may have moved it off the face."""
 
 
 class Ellipse(NamedTuple):
@@ -44,7 +44,7 @@ class Ellipse(NamedTuple):
 
 
 class ExplicitSet(NamedTuple):
-    """A set written out: rows @ a <= bounds, and ellipses. The box is left out."""
+    """The inequalities of a set: rows @ a <= bounds, and ellipses. The box is not included."""
 
     rows: Tensor  # (..., m, d)
     bounds: Tensor  # (..., m)
@@ -52,18 +52,18 @@ class ExplicitSet(NamedTuple):
 
 
 class Constraint(ABC):
-    """A feasible set A(obs) inside the box [-1, 1]^dim. ValueError for dim < 1, TypeError where it is not whole.
+    """A feasible set A(obs) inside the box [-1, 1]^dim. ValueError for dim < 1, TypeError if it is not an integer.
 
-    A subclass implements the protected methods. They receive float64 tensors; `action` (or `direction`, `gradient`)
-    has the common leading shape already. `at` is what `_at(obs)` returned: the observation, if that is not overridden.
+    A subclass implements the protected methods. They receive float64 tensors; `action` (or `direction`, `gradient`) has
+    the common leading shape already. `at` is what `_at(obs)` returned: the observation, unless `_at` is overridden.
     """
 
     origin_centered: bool = True
-    """True where `center(obs)` is the origin for every obs, so that no centre needs to be stored."""
+    """True if `center(obs)` is the origin for every obs. No centre needs to be stored then."""
     on_empty: OnEmpty = "error"
-    """What happens where no action meets the constraint, "error" or "least"; see `GeneralConstraint`."""
+    """What happens if no action satisfies the constraint, "error" or "least"; see `GeneralConstraint`."""
     solved_on_cpu: bool = False
-    """True where a solver runs on the CPU, so that a GPU has to wait. No CUDA graph can hold such a set."""
+    """True if a solver runs on the CPU. A GPU has to wait for it, and a CUDA graph cannot contain it."""
 
     def __init__(self, dim: int):
         if dim < 1:
@@ -71,7 +71,7 @@ class Constraint(ABC):
         self.dim = operator.index(dim)
         self._center_calls = FirstCalls()
 
-    # ---------------------------------------------------------------- what a subclass gives
+    # ---------------------------------------------------------------- what a subclass implements
 
     def _at(self, obs: Tensor) -> Any:
         """The coefficients at `obs` (..., n), for the other protected methods, or the observation itself.
@@ -82,20 +82,21 @@ class Constraint(ABC):
 
     @abstractmethod
     def _violation(self, at: Any, action: Tensor) -> Tensor:
-        """Excess (...) over the constraint, the box left out."""
+        """Excess (...) over the constraint, without the box."""
 
     @abstractmethod
     def _project(self, at: Any, action: Tensor) -> tuple[Tensor, JacobianProduct]:
         """Closest feasible point (..., d) and the product with the projection's Jacobian there.
 
-        A NaN in the action is a NaN in the point, at least in that coordinate. Otherwise a broken policy would become
-        feasible unnoticed.
+        A NaN in the action must give a NaN in the point, at least in that coordinate. Otherwise a broken policy would
+        become feasible unnoticed.
         """
 
     def _boundaries(self, at: Any, point: Tensor) -> list[Boundary]:
-        """The surfaces, the box's left out, that can hold a projection which ends at `point` (..., d).
+        """The surfaces, without those of the box, that can be active at the projection `point` (..., d).
 
-        Gradients of projections with respect to the coefficients need them; RuntimeError where a set has none.
+        Gradients of projections with respect to the observation or the coefficients need them. RuntimeError if the set
+        does not define them.
         """
         raise RuntimeError(
             f"projections of {type(self).__name__} have no gradient with respect to the observation or to learned"
@@ -103,12 +104,12 @@ class Constraint(ABC):
         )
 
     def _free(self, point: Tensor) -> Tensor:
-        """The coordinates (..., d) that are held neither by the box nor by a kink of the set at `point`."""
+        """Mask (..., d) of the coordinates of `point` that neither the box nor a kink of the set holds."""
         return point.abs() < AT_FACE
 
     @abstractmethod
     def _gauge_gradients(self, at: Any, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        """Gradients (..., d) of the gauges of the set's parts with respect to `direction`, the box left out.
+        """Gradients (..., d) of the gauges of the set's parts with respect to `direction`, without the box.
 
         They are differentiable in `direction`, the centre and the coefficients, and 0 where `direction` is 0. `center`
         is None for the origin.
@@ -123,7 +124,7 @@ class Constraint(ABC):
         return self._violation(at, action).clamp(min=0.0)
 
     def _center(self, at: Any) -> Tensor:
-        """Interior point (..., d), or a single one (d,) for every obs. A set with `origin_centered` has none."""
+        """Interior point (..., d), or (d,) if it is the same for every obs. Unused if `origin_centered`."""
         raise NotImplementedError(f"{type(self).__name__} needs _center, or origin_centered = True")
 
     def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
@@ -138,7 +139,7 @@ class Constraint(ABC):
         )
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
-        """The set's rows and ellipses. A part of an `Intersection` must have them; TypeError where it does not."""
+        """The set's rows and ellipses at obs (..., n). TypeError by default; a part of an `Intersection` needs it."""
         raise TypeError(f"{type(self).__name__} does not write out its rows and ellipses")
 
     # ---------------------------------------------------------------- the interface
@@ -160,19 +161,20 @@ class Constraint(ABC):
     def penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         """Penalty (...) of the '+' algorithms on an action in the box (paper, "Algorithms").
 
-        It is the norm of max(Ax - b, 0) with unit rows, max(sqrt(x'Qx) - sqrt(b), 0) with tr Q = dim, and the sum
-        where both are present.
+        It is the norm of max(Ax - b, 0) with unit rows, max(sqrt(x'Qx) - sqrt(b), 0) with tr Q = dim, and the sum if
+        both are present.
         """
         obs64, action64 = self._broadcast(obs, action)
         return self._penalty(self._at(obs64), action64).to(action.dtype)
 
     def features(self, obs: Tensor) -> Tensor:
-        """The numbers (..., k), float64, that the set at obs (..., n) depends on: its coefficients without constants.
+        """The numbers (..., k), float64, that determine the set at obs (..., n): its coefficients without constants.
 
-        For a set that reads the observation in each method, they are the observation.
+        For a set whose methods read the observation itself, they are the observation.
         """
         check_observation(obs)
-        # With three more dimensions than the observations have, a coefficient cannot be a constant, which has two.
+        # The observations get three extra leading axes, and so do coefficients that depend on them. Constants have at
+        # most two axes in all, so the number of axes tells them apart.
         obs64, lead = obs.double(), obs.shape[:-1]
         values = [value for value in tensors_of(self._at(obs64[None, None, None])) if value.dim() >= 3 + len(lead)]
         rows = [value.reshape(*lead, value.shape[3 + len(lead) :].numel()) for value in values]
@@ -192,15 +194,15 @@ class Constraint(ABC):
         return projected.to(action.dtype)
 
     def least_violation(self, obs: Tensor) -> Tensor:
-        """The least violation (...) that an action in the box can have, at obs (..., n); 0 if the set has one."""
+        """Smallest violation (...) of all actions in the box at obs (..., n); 0 if the set is not empty."""
         check_observation(obs)
         return obs.new_zeros(obs.shape[:-1])  # closed forms contain the origin
 
     def center(self, obs: Tensor) -> Tensor:
         """Interior point (..., d) of the set, in the dtype of `obs` (paper, "alpha-Projection Layer").
 
-        It is the Chebyshev centre of a linear set, the ellipse's centre otherwise, the origin where both are present.
-        The classes of sets of one's own say what theirs is.
+        It is the Chebyshev centre of a linear set, the centre of an ellipse, and the origin if both are present. The
+        docstrings of the general sets, such as `LinearConstraint`, define their centres.
         """
         check_observation(obs)
         if self.origin_centered:
@@ -228,7 +230,7 @@ class Constraint(ABC):
     def ray(self, obs: Tensor, action: Tensor, center: Tensor | None = None) -> Ray:
         """The ray from the centre that maps `action`: one evaluation of the gauge serves a map and its density.
 
-        Offsets are at most 1e150 long, as the squares of longer ones are infinite.
+        Offsets must be at most 1e150 long, because squares of longer ones overflow.
         """
         obs64, action64 = self._broadcast(obs, action)
         at = self._at(obs64)
@@ -272,7 +274,8 @@ class Constraint(ABC):
     ) -> Tensor:
         """Log-density (...) of `alpha_map(obs, action)` for `action` ~ N(mean, diag std^2).
 
-        With respect to volume where `action` is feasible, to the boundary's surface measure where it is not.
+        The density is with respect to volume where `action` is feasible, and to the boundary's surface measure
+        elsewhere.
         Source: paper, "alpha-projection with SAC", with the solid angle of dimension d.
         """
         check_tensor("mean", mean)
@@ -282,7 +285,7 @@ class Constraint(ABC):
     def linear_oracle(self, obs: Tensor, gradient: Tensor) -> Tensor:
         """argmax (..., d) over the set of <c, gradient> (NFWPO's Frank-Wolfe step, paper Eq. Frank-Wolfe direction).
 
-        It is a constant, without gradients. RuntimeError where the observation or learned coefficients ask for them.
+        The result has no gradients. RuntimeError if the observation or learned coefficients require them.
         """
         check_tensor("gradient", gradient)
         refuse_transforms("linear_oracle")
@@ -297,8 +300,8 @@ class Constraint(ABC):
     def sample(self, obs: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
         """Feasible points (..., count, d), uniform in each set A(obs), in the dtype of `obs`.
 
-        Random numbers come from `generator`, or from PyTorch's default one. A set without a closed form takes 4 d
-        (d + 4) steps of two gauges each, which is long from d = 30 on. ValueError for count < 1.
+        Random numbers come from `generator` (default: PyTorch's). A set without a closed form takes 4 d (d + 4) steps
+        with two gauges each, which is slow for d >= 30. ValueError for count < 1.
         """
         refuse_transforms("sample")
         if operator.index(count) < 1:
@@ -310,7 +313,7 @@ class Constraint(ABC):
     # ---------------------------------------------------------------- shared pieces
 
     def _differentiable_projection(self, at: Any, action: Tensor) -> Tensor:
-        """The projection (..., d) with gradients by the action and by the tensors of `at`."""
+        """The projection (..., d) with gradients with respect to the action and the tensors in `at`."""
         return differentiable_projection(Solver(self._project, self._boundaries, self._free), at, action)
 
     def _gauge_and_gradient(self, at: Any, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -322,7 +325,7 @@ class Constraint(ABC):
         return largest_gauge(direction, box, *self._gauge_gradients(at, direction, center))
 
     def _given_center(self, at: Any, center: Tensor) -> Tensor:
-        """A centre (..., d) that was given, in float64. ValueError for another shape, and see `_check_center`."""
+        """The caller's centre (..., d) in float64. ValueError for a wrong shape; `_check_center` checks the values."""
         check_tensor("center", center)
         if center.shape[-1:] != (self.dim,):
             raise ValueError(f"expected {self.dim} coordinates of the center, got shape {tuple(center.shape)}")
@@ -336,7 +339,7 @@ class Constraint(ABC):
         """Raise a ConstraintError for a centre that is not inside the set; a NaN is passed on."""
         if self._center_calls.readable(center):
             outside = torch.maximum(center.abs().amax(-1) - 1.0, self._violation(at, center)) >= -ON_BOUNDARY
-            if outside.any():  # a set may be thinner than that, and its own centre is right all the same
+            if outside.any():  # a set may be thinner than that; its own centre is valid all the same
                 own = torch.zeros_like(center) if self.origin_centered else self._center(at)
                 outside = outside & ((center - own).abs().amax(-1) > ROUNDING)
             require(~outside.flatten(), "the center is not inside the set", name_samples(outside.shape))

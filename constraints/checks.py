@@ -1,4 +1,4 @@
-"""Checks of what functions of the observation return, and of what methods are given."""
+"""Checks of coefficients that are functions of the observation, and of the arguments of methods."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from torch import Tensor
 from constraints.errors import ConstraintError, name_samples, require
 
 ON_BOUNDARY = 1e-12
-"""A centre that is nearer than this to the boundary is on it, up to rounding."""
+"""A centre closer than this to the boundary counts as lying on it."""
 ROUNDING = 1e-7
-"""How far a centre in the box moves, at most, when it is rounded to float32."""
+"""Largest change of a coordinate of a centre in the box when it is rounded to float32."""
 _SAME = 1e-4
-"""Values of a function in a batch and alone that differ by no more than this share are the same in float32."""
-# Asymmetry and negative eigenvalues of a matrix up to this share of its largest entry are rounding, in float32 too.
+"""Relative tolerance, for float32, between values of a function in a batch and for one observation alone."""
+# Asymmetry and negative eigenvalues of a matrix up to this share of its largest entry count as rounding of float32.
 _ROUNDING = 1e-6
 
 
 def check_tensor(what: str, value: Any) -> None:
-    """Raise a TypeError for what is not a tensor."""
+    """Raise a TypeError if the value is not a tensor."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{what} must be a torch.Tensor, got {type(value).__name__}; torch.as_tensor({what}) makes one")
 
@@ -33,13 +33,13 @@ def check_precision(what: str, value: Tensor) -> None:
 
 
 def check_observation(obs: Any) -> None:
-    """Raise a TypeError for what is not a tensor of float32 or float64. Results get the dtype of `obs`."""
+    """Raise a TypeError if `obs`, whose dtype results get, is not a tensor of float32 or float64."""
     check_tensor("obs", obs)
     check_precision("observations", obs)
 
 
 def check_function(what: str, value: Any) -> None:
-    """Raise a TypeError for what is not a function."""
+    """Raise a TypeError if the value is not a function."""
     if not callable(value):
         raise TypeError(f"{what} must be a function of the observation, got {type(value).__name__}")
 
@@ -47,8 +47,8 @@ def check_function(what: str, value: Any) -> None:
 def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tensor, finite: bool = True) -> Tensor:
     """Coefficients as float64 (*lead, *shape), finite and of the expected shape, or a ConstraintError.
 
-    -1 in `shape` stands for any size; lead may be the observation's leading shape or one that broadcasts to it. Values
-    are looked at where they have to be `finite`.
+    -1 in `shape` stands for any size; lead may be the observation's leading shape or one that broadcasts to it. With
+    `finite` False, NaN and infinite values pass unread.
     """
     values = torch.as_tensor(values, dtype=torch.float64, device=obs.device)
     lead = values.shape[: values.dim() - len(shape)]
@@ -73,17 +73,17 @@ def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tens
 
 @torch.no_grad()
 def check_each_alone(function: Callable[[Tensor], Any], values: Tensor, what: str, axes: int, obs: Tensor) -> None:
-    """Raise a ConstraintError if `values`, those of `function` at the batch obs, are others where one stands alone.
+    """Raise a ConstraintError if `values`, of the batch `obs`, differ from what `function` returns for one observation.
 
-    A function of a single observation may pass as one of a batch: rows (d,) of n observations look like n rows of each.
-    `axes` is the number of the values' own axes.
+    A function written for single observations can seem to work on a batch: rows (d,) of n observations look like n rows
+    for each observation. `axes` is the number of axes of the values of one observation.
     """
     lead = obs.shape[:-1]
     one = obs[(slice(-1, None),) * len(lead)]
     try:
         alone = checked(function(one), what, (-1,) * axes, one, finite=False)
     except (ValueError, RuntimeError, IndexError):
-        return  # it has the coefficients of one batch, whatever the observation
+        return  # it returns the coefficients of a fixed batch, whatever the observation
 
     def last_of(values: Tensor, lead: torch.Size) -> Tensor:
         return values.expand(*lead, *values.shape[values.dim() - axes :])[(-1,) * len(lead)]

@@ -1,7 +1,7 @@
 """The coefficients of the closed forms: functions of the observation, and bounds that may be numbers.
 
-They are checked on their first observations, because a check takes as long as a closed form. `check_inputs(True)` has
-them checked always.
+They are checked in the first calls only, because a check takes as long as a closed form. `check_inputs(True)` checks
+them in every call.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ _always = False
 
 
 def check_inputs(always: bool = True) -> bool:
-    """Have the closed forms check coefficients and given centres in every call of this process, not just in the first.
+    """Make the closed forms check coefficients and given centres in every call of this process, not only in the first.
 
     They raise a ConstraintError for values that are NaN, infinite or of the wrong sign or shape, for a matrix that is
-    not symmetric and positive semi-definite, and for a centre that is not inside the set. General sets always do. On a
-    GPU, each check waits for the device; in a CUDA graph there can be none. Returns whether they did so before.
+    not symmetric and positive semi-definite, and for a centre that is not inside the set. General sets always check
+    them. On a GPU, each check waits for the device, so a CUDA graph cannot contain it. Returns the previous value of
+    `always`.
     """
     global _always
     before, _always = _always, always
@@ -38,18 +39,18 @@ def check_inputs(always: bool = True) -> bool:
 
 
 class FirstCalls:
-    """Tells which calls to check: those of the first that have values which Python can look at without waiting."""
+    """Decides which calls to check: the first ones, if their values can be read without waiting for a device."""
 
     def __init__(self) -> None:
         self._left = _FIRST
 
     def wanted(self) -> bool:
-        """Whether to check shapes in this call, and values where `readable` allows it."""
-        # torch.compile would compile anew for each number of calls.
+        """Whether to check shapes in this call, and values if `readable` allows it."""
+        # torch.compile would recompile for each number of calls.
         return (self._left > 0 and not torch.compiler.is_compiling()) or _always
 
     def readable(self, *values: Tensor) -> bool:
-        """Whether to check values in this call, which counts."""
+        """Count this call, and return whether to check its values."""
         self._left -= 1
         return (
             all(value.is_cpu or (_always and value.device.type != "meta") for value in values) and not is_transformed()
@@ -57,10 +58,10 @@ class FirstCalls:
 
 
 class Coefficient:
-    """A function of the observation whose values have the last axes `shape`; `check` says what else they must be.
+    """A function of the observation with values (..., *shape), which `check` may test further.
 
-    A ConstraintError names the coefficient by `what` and, where values are wrong, the sample. Observations that are
-    not finite give what they give: their NaN is passed on.
+    A ConstraintError names the coefficient by `what` and, for wrong values, the sample. If an observation is not
+    finite, values are not checked and NaN is passed on.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class Coefficient:
 
 
 class BoundCoefficient:
-    """A bound, ready to be compared with (..., 1). ValueError for a number that is not positive and finite."""
+    """A bound that broadcasts against (..., 1). ValueError for a number that is not positive and finite."""
 
     def __init__(self, what: str, bound: Bound):
         self._number: float | None = None

@@ -62,7 +62,7 @@ def radial_log_det(gauge: Tensor, dim: int) -> Tensor:
 def _quadrature(device: torch.device) -> tuple[Tensor, Tensor]:
     """Gauss-Legendre nodes and weights on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    # Whatever the mode of the first caller: autograd takes no tensors that were made in inference mode.
+    # All callers share the tensors, and autograd cannot use tensors that were made in inference mode.
     with torch.inference_mode(False):
         return torch.as_tensor((nodes + 1) / 2, device=device), torch.as_tensor(weights / 2, device=device)
 
@@ -80,7 +80,8 @@ def log_ray_integral(
         dim: d >= 1.
         derivatives: whether to compute the two derivatives.
     Returns:
-        log I, d log I / dA and d log I / dB, each (...); None for the derivatives without them. Outside autograd.
+        log I, d log I / dA and d log I / dB, each (...), without autograd. Without `derivatives`, the last two are
+        None.
     """
     # In w = A t, the log of the integrand is h(w) = k log(w / A) - (w + B)^2 on w >= A: concave (k = d - 1).
     k = dim - 1
@@ -164,11 +165,11 @@ def alpha_boundary_log_density(
     with dOmega = r0^(1-d) cos(theta) dsigma (it prints r0^-1, the case d = 2). Computed in float64 inside.
 
     Args:
-        boundary_offset: (..., d) b - c, where the gauge L is 1 (never zero, therefore).
+        boundary_offset: (..., d) b - c, where the gauge L is 1, so it is never zero.
         gauge_gradient: (..., d) gradient of L there, or anywhere else on the ray.
         center, mean, std: (..., d) c, and the Gaussian before the map.
     Returns:
-        (...) log q(b), in the type of `boundary_offset`.
+        (...) log q(b), in the dtype of `boundary_offset`.
     """
     refuse_transforms("the density of the alpha map")
     return _AlphaBoundaryLogDensity.apply(boundary_offset, gauge_gradient, center, mean, std)

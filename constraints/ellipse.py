@@ -15,8 +15,8 @@ from constraints.jacobian import JacobianProduct, deflated_jacobian
 from constraints.numerics import keep_nan, safe_sqrt
 from constraints.scalar_dual import BoxProblem, RowProblem, minimize_under_ellipse
 
-_ROUNDING = 1e-13  # a point outside the box by no more than this is in it
-_FLAT = 1e-280  # a'Qa below this may be the rounding of 0: the ellipse does not end in the direction a
+_ROUNDING = 1e-13  # a point outside the box by no more than this counts as inside
+_FLAT = 1e-280  # a'Qa below this may be 0 up to rounding: the ellipse does not end in the direction a
 _MAX_STEPS = 40  # Newton needs 3 to 10
 
 
@@ -30,7 +30,7 @@ class Scales(NamedTuple):
 class DiagonalEllipse(Constraint):
     """sum s_i a_i^2 <= bound in the box, s = scale(obs) >= 0; some or all s_i may be 0.
 
-    The bound is a number or a function of obs. ValueError for a number that is not positive.
+    The bound is a number or a function of obs. ValueError for a number that is not positive and finite.
     """
 
     def __init__(self, scale: Coefficients, bound: Bound, dim: int):
@@ -69,8 +69,8 @@ class DiagonalEllipse(Constraint):
 class PlanarEllipse(Constraint):
     """a'Qa <= bound in the box, Q = matrix(obs) (..., 2, 2) positive semi-definite; a slab where Q is singular (R+T).
 
-    Projection and oracle are exact by cases: the box alone, the ellipse alone, or one of the box's four faces.
-    The bound is a number or a function of obs. ValueError for a number that is not positive.
+    Projection and oracle are exact, by cases: the box alone, the ellipse alone, or one of the box's four faces. The
+    bound is a number or a function of obs. ValueError for a number that is not positive and finite.
     """
 
     def __init__(self, matrix: Coefficients, bound: Bound):
@@ -96,8 +96,8 @@ class PlanarEllipse(Constraint):
         on_ellipse, mu = planar.project(action)
         in_box = on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + _ROUNDING
 
-        # On a face, mirrored to a_i = 1, the best point is the one of its interval nearest to the other coordinate.
-        # Squared distances leave out |action|^2: beside it, those of a far point would be equal.
+        # On a face, mirrored to a_i = 1, the best point is that of the feasible interval nearest to the other
+        # coordinate. Squared distances leave out |action|^2, which would swallow their differences for a far point.
         own, other = _mirrored(action), _mirrored(action.flip(-1))
         low, high, met = planar.faces()
         moved = torch.minimum(torch.maximum(other, low), high)
@@ -174,7 +174,7 @@ class _Planar(NamedTuple):
         """Projection (..., 2) on the ellipse alone, and its multiplier mu (..., 1).
 
         The point is inv(1 + mu Q) action, whose value a'Qa is numerator / scale^2 with both polynomials in mu. Newton's
-        method on 1 / sqrt(value), which is concave and rises: from the left it never passes the root.
+        method solves for 1 / sqrt(value), which is concave and increasing, so from the left it never passes the root.
         """
         trace, determinant = self.diagonal.sum(-1, keepdim=True), self.determinant()
         adjugate = self.adjugate_times(action)
@@ -191,14 +191,14 @@ class _Planar(NamedTuple):
             rise = torch.addcmul((trace + 2.0 * turn) * value, scale, slope, value=-1.0).clamp_(min=1e-300)
             step = (value.sqrt().div_(root_bound) - scale).mul_(value).div_(rise).clamp_(min=0.0)
             mu = mu + step
-            # A GPU does all steps, as in minimize_under_ellipse. A NaN counts as settled.
+            # A GPU takes all steps, as in minimize_under_ellipse. A NaN counts as settled.
             if action.is_cpu and not (step > 1e-12 * mu).any():
                 break
         return torch.addcmul(action, mu, adjugate) / (1.0 + mu * (trace + mu * determinant)), mu
 
     def faces(self) -> tuple[Tensor, Tensor, Tensor]:
         """The feasible interval (low, high) of the other coordinate on the faces a_1 = 1 and a_2 = 1, and whether there
-        is one, each (..., 2, 1). The faces a_i = -1 have the same, mirrored."""
+        is one, each (..., 2, 1). The faces a_i = -1 have the mirrored intervals."""
         held, moved = self.diagonal, self.diagonal.flip(-1).clamp(min=1e-200)
         discriminant = self.cross.square() - moved * (held - self.bound)
         root = discriminant.clamp(min=0.0).sqrt()
@@ -225,8 +225,7 @@ def minimize_in_ellipse(
 ) -> tuple[Tensor, JacobianProduct]:
     """Minimiser (..., d) of sum(shift a^2 / 2 - target a) over a problem's set and sum(scale a^2) <= bound.
 
-    The problem holds the target mirrored to be positive. Also returns the product with the minimiser's Jacobian in
-    the target.
+    The problem must hold |target|. Also returns the product with the minimiser's Jacobian with respect to the target.
     """
     point, solution, mu = minimize_under_ellipse(problem, shift, scale, bound)
     point = torch.copysign(within_ellipse(point, scale * point, bound), target)
@@ -239,7 +238,7 @@ def minimize_in_ellipse(
 
 
 def within_ellipse(point: Tensor, bent: Tensor, bound: Tensor | float) -> Tensor:
-    """The point (..., d), shrunk where rounding takes it out of point'Q point <= bound; `bent` is Q point."""
+    """The point (..., d), shrunk if rounding took it out of point'Q point <= bound; `bent` is Q point."""
     value = (point * bent).sum(-1, keepdim=True)
     return point * (bound / value.clamp(min=bound)).sqrt()
 
@@ -261,7 +260,7 @@ def ellipse_gauge_gradient(
 
     1 / L is the positive root of the quadratic in t at center + t direction.
     """
-    # Comparisons are such that a NaN stays. A flat direction does not bound the ray.
+    # The comparisons let a NaN pass. A flat direction does not bound the ray.
     curvature = (direction * bent_direction).sum(-1, keepdim=True)
     if center is None or bent_center is None:
         flat = curvature < _FLAT

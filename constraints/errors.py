@@ -10,7 +10,7 @@ from torch import Tensor
 class SampleName:
     """Names a sample of a flattened batch of shape `lead`, as in 'sample 3' or 'sample (1, 2)'.
 
-    With `chosen`, the batch is a part of that one: its sample i is sample chosen[i] there.
+    With `chosen`, it numbers a selection of these samples: sample i is sample chosen[i] of the batch.
     """
 
     def __init__(self, lead: tuple[int, ...], chosen: list[int] | None = None):
@@ -37,22 +37,22 @@ class SampleName:
 
 
 class ConstraintError(ValueError):
-    """An operation that the constraint's coefficients, its observation or the set itself do not allow.
+    """The constraint's coefficients, the observation or the set itself do not allow an operation.
 
-    `sample` is the position of the sample that caused it, an index for each leading dimension of the observation that
-    the method got (a tuple; empty for a single observation), or None where no sample did.
+    `sample` is the position of the sample that caused the error: a tuple with an index for each leading dimension of
+    the method's observation, empty for a single observation. It is None if no single sample is the cause.
     """
 
     def __init__(self, message: str, sample: tuple[int, ...] | None = None):
         super().__init__(message)
         self.sample = sample
 
-    def __reduce__(self):  # so that a copy, as another process gets it, has the sample too
+    def __reduce__(self):  # so that a pickled copy for another process keeps the sample
         return type(self), (str(self), self.sample)
 
 
 class EmptySetError(ConstraintError):
-    """No action meets the constraint of one sample, or none has room around it where a method needs that."""
+    """The set of one sample is empty, or has no interior although a method needs one."""
 
 
 def name_samples(lead: tuple[int, ...]) -> SampleName:

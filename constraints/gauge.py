@@ -11,9 +11,9 @@ from torch import Tensor
 
 
 def box_gauge_gradient(direction: Tensor, center: Tensor | None) -> Tensor:
-    """Gradient (..., d) of the gauge of the box around `center` (None: the origin), where it is max_i |u_i|.
+    """Gradient (..., d) of the gauge of the box around `center`: the row of the face that the ray meets first.
 
-    It is the row of the face that the ray meets first.
+    For None, the centre is the origin and the gauge is max_i |u_i|.
     """
     direction = direction.detach()
     sign = direction.sign()

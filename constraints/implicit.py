@@ -1,16 +1,16 @@
 """Gradients of projections with respect to the action and to the coefficients of the set, by its KKT conditions.
 
-A projection a of x with multipliers lam on the surfaces g_j = 0 that hold it, and without the coordinates that the box
-or a kink holds, has a - x + sum lam_j grad g_j = 0 and g_j = 0. These define a as a function of x and of all that g
-depends on. They are differentiated by solving the transposed system for the gradient v of a loss with respect to a:
+Let a be the projection of x, with multipliers lam on the active surfaces g_j = 0. In the coordinates that neither the
+box nor a kink holds, a - x + sum lam_j grad g_j = 0 and g_j = 0. These equations define a as a function of x and of all
+that g depends on. Their derivatives solve the transposed system for the gradient v of a loss with respect to a:
 
     p + sum lam_j hess g_j p + sum w_j grad g_j = v,    grad g_j . p = 0.
 
 Then p is the gradient with respect to x, and -sum (lam_j grad g_j . p + w_j g_j), differentiated with p, w, lam and a
-held fixed, the one with respect to the coefficients. p is the closed form of `constraints.jacobian`.
+held fixed, is the gradient with respect to the coefficients. p is the closed form of `constraints.jacobian`.
 
 The backward passes here solve the projection again. The usual case, gradients with respect to the action alone, does
-not come here: it keeps what the solution found.
+not use them: it keeps the Jacobian of the solution.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from torch import Tensor
 from constraints.jacobian import JacobianProduct
 from constraints.numerics import one_where_zero, root_or_one
 
-_ACTIVE = 1e-7  # a surface holds points whose value g is above minus this
+_ACTIVE = 1e-7  # a surface is active at points whose value g is above minus this
 _DEPENDENT = 1e-10  # squared sines of angles between normals below this are 0 up to rounding
 
 
 class Boundary(NamedTuple):
-    """A surface g = 0, smooth at a point, both differentiable in the point and the set's coefficients."""
+    """A surface g = 0, smooth at a point. Both fields are differentiable in the point and the coefficients."""
 
     value: Tensor  # (...) g, at most 0 inside and of order 1 there
     normal: Tensor  # (..., d) gradient of g
@@ -40,9 +40,9 @@ class Solver(NamedTuple):
 
     project: Callable[[Any, Tensor], tuple[Tensor, JacobianProduct]]
     boundaries: Callable[[Any, Tensor], list[Boundary]]
-    """The surfaces, the box's left out, that can hold a projection which ends at a point (..., d)."""
+    """The surfaces, without those of the box, that can be active at a projection (..., d)."""
     free: Callable[[Tensor], Tensor]
-    """The coordinates (..., d) of a point that neither the box nor a kink holds."""
+    """Mask (..., d) of the coordinates of a point that neither the box nor a kink holds."""
 
 
 def tensors_of(at: Any) -> list[Tensor]:
@@ -51,12 +51,12 @@ def tensors_of(at: Any) -> list[Tensor]:
 
 
 def differentiable_projection(solver: Solver, at: Any, action: Tensor) -> Tensor:
-    """The projection (..., d) of `action` (..., d), with first derivatives by it and by the tensors of `at`."""
+    """The projection (..., d) of `action` (..., d), with first derivatives in it and in the tensors of `at`."""
     return _Projection.apply(_Partial(solver, at), action, *tensors_of(at))
 
 
 class _Partial(NamedTuple):
-    """A solver for coefficients like `at`, whose tensors are given one by one."""
+    """A solver that takes coefficients tensor by tensor, in place of the tensors in `at`."""
 
     solver: Solver
     at: Any
@@ -72,7 +72,7 @@ class _Partial(NamedTuple):
 
 
 def _with_batch_first(size: int, dims: Sequence[int | None], tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Tensors (..., k) for torch.func.vmap, its axis in front of all leading ones; the first tensor has them all."""
+    """Tensors (..., k) with the axis of torch.func.vmap in front of all leading axes; the first one always has it."""
     rank = max(tensor.dim() - (dim is not None) for tensor, dim in zip(tensors, dims, strict=True))
     moved: list[Tensor] = []
     for tensor, dim in zip(tensors, dims, strict=True):
@@ -146,7 +146,7 @@ def _coefficient_gradients(
     largest = one_where_zero(held.abs().amax(-1, keepdim=True))
     length = largest * root_or_one((held / largest).square().sum(-1, keepdim=True))
     unit = held / length
-    # Of normals that span each other the shortest combination counts.
+    # For dependent normals, the shortest combination counts.
     inverse = torch.linalg.pinv(unit @ unit.mT, rtol=_DEPENDENT, hermitian=True)
 
     def components(vector: Tensor) -> Tensor:

@@ -18,8 +18,8 @@ def deflated_jacobian(curvature: Tensor, *normals: Tensor) -> JacobianProduct:
 
     Args:
         curvature: (..., d) diagonal of the inverse Hessian, 0 (or False) on coordinates that are held fixed.
-        normals: (..., d) each, the gradient of an active constraint, 0 where it is inactive. Each takes the direction
-            that it blocks out of J: J <- J - (J n)(J n)' / (n' J n).
+        normals: (..., d) each, the gradient of an active constraint, 0 where it is inactive. Each removes the direction
+        that it blocks from J: J <- J - (J n)(J n)' / (n' J n).
     """
 
     def product(vector: Tensor) -> Tensor:
@@ -56,5 +56,5 @@ class _WithJacobian(torch.autograd.Function):
 
 
 def with_jacobian(action: Tensor, projected: Tensor, product: JacobianProduct) -> Tensor:
-    """The projection (..., d) of `action`, solved outside autograd, with its Jacobian. In the action's dtype."""
+    """The projection (..., d) of `action`, solved outside autograd, with its Jacobian and in the action's dtype."""
     return _WithJacobian.apply(action, (projected, product))

@@ -33,8 +33,8 @@ class _Both(NamedTuple):
 class WeightedL1AndEllipse(Constraint):
     """sum |w_i a_i| <= weight_bound and sum s_i a_i^2 <= scale_bound in the box.
 
-    Bounds are numbers or functions of obs. Projection and oracle have two multipliers. The row's is exact for each
-    value of the ellipse's.
+    Bounds are numbers or functions of obs. Projection and oracle search for the ellipse's multiplier; for each of its
+    values, the row's multiplier is exact.
     """
 
     def __init__(self, weight: Coefficients, weight_bound: Bound, scale: Coefficients, scale_bound: Bound, dim: int):

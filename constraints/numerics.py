@@ -33,12 +33,12 @@ def times(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def is_transformed() -> bool:
-    """Whether a transform of torch.func is at work, so that tensors may have hidden axes."""
+    """Whether a transform of torch.func is active, so that tensors may have hidden axes."""
     return torch._C._are_functorch_transforms_active()
 
 
 def is_mapped() -> bool:
-    """Whether torch.func.vmap is at work, so that values of tensors cannot be looked at."""
+    """Whether torch.func.vmap is active, so that values of tensors cannot be read."""
     if not is_transformed():
         return False
     functorch = torch._C._functorch
@@ -46,13 +46,13 @@ def is_mapped() -> bool:
 
 
 def refuse_transforms(what: str) -> None:
-    """Raise a RuntimeError where a transform of torch.func is at work."""
+    """Raise a RuntimeError if a transform of torch.func is active."""
     if is_transformed():
         raise RuntimeError(f"{what} has no torch.func transforms; it takes batches of any leading shape as it is")
 
 
 def is_traced(*values: object) -> bool:
-    """Whether autograd records what is done with one of the values, or a transform of torch.func is at work."""
+    """Whether autograd records operations on one of the values, or a transform of torch.func is active."""
     return is_transformed() or (
         torch.is_grad_enabled() and any(isinstance(value, Tensor) and value.requires_grad for value in values)
     )

@@ -1,4 +1,4 @@
-"""The maps into a feasible set along rays from its centre, and the densities that a policy has after them.
+"""The maps into a feasible set along rays from its centre, and the densities of a policy after them.
 
 One evaluation of the gauge serves a map, its density and the gradients of both. Gradients are closed forms.
 """
@@ -17,10 +17,10 @@ from constraints.density import alpha_boundary_log_density, radial_log_det
 from constraints.gauge import box_gauge_gradient
 from constraints.numerics import one_where_zero, refuse_second_derivatives, with_gradient
 
-_TINY = 1e-150  # a gauge in the place of 0
+_TINY = 1e-150  # replaces a gauge of 0
 # The gauge map's factor phi differs from direction to direction, so the gradient of log phi grows like 1 / |u| towards
-# u = 0, and in two dimensions its variance would be infinite. Nearer to 0 than this max_i |u_i| it grows no more; one
-# in a million uniform u is that near.
+# u = 0, and in two dimensions its variance would be infinite. Where max_i |u_i| is below this, the gradient stops
+# growing. In two dimensions, one in a million uniform u is that near to 0.
 _NEAR_CENTER = 1e-3
 
 
@@ -28,15 +28,15 @@ class Ray:
     """The ray from a centre c on which a map moves actions (..., d).
 
     The alpha and radial maps move an action on its own ray, along its offset v = action - c. The gauge map takes the
-    action for the offset. All results are in the action's dtype.
+    action itself as the offset. All results are in the action's dtype.
 
     Args:
         action: (..., d) float32 or float64, before the map.
         center: (..., d) or (d,) float64, None for the origin.
         offset: (..., d) float64, action - c with all leading dimensions.
         gauge_of: returns the set's gauge L (...) around c and its gradient (..., d), for offsets (..., d).
-        traced: whether results are differentiated by more than the action: the gradient of the gauge then depends on
-            the centre and on the set's coefficients. Plain autograd does that; without it, gradients are closed forms.
+        traced: whether results are differentiated with respect to more than the action: the centre and the set's
+            coefficients. Plain autograd does that; without it, gradients are closed forms.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Ray:
     ):
         self.action, self.center, self.offset = action, center, offset
         self._gauge_of, self._traced = gauge_of, traced
-        # Of the time when the ray was made, whatever the mode of the first use.
+        # The grad mode when the ray was made, whatever it is at the first use.
         self._grad_enabled = torch.is_grad_enabled() if traced else offset.requires_grad
 
     @property
@@ -69,7 +69,7 @@ class Ray:
         return gauge.detach(), gradient
 
     def _differentiable_gauge(self) -> Tensor:
-        """The gauge L (...) of the offset as a function of all that is differentiated by."""
+        """The gauge L (...) of the offset, with gradients."""
         if self._traced:
             return (self.gradient * self.offset).sum(-1)
         return with_gradient(self.offset, self.gauge, self.gradient)
@@ -94,7 +94,7 @@ class Ray:
     def gauge_map(self) -> Tensor:
         """Gauge map (..., d), c + phi u with phi = max_i |u_i| / L(u), of u = `action` in the box.
 
-        At u = 0 it has no derivative. Value and gradient there are those of phi = 1.
+        It has no derivative at u = 0. Value and gradient there are those for phi = 1.
         """
         if self._traced:
             offset = self._action64()
@@ -123,7 +123,7 @@ class Ray:
         """Log-density (...) of `gauge_map()`, given the log-density `log_prob` (...) of the action.
 
         phi is homogeneous of degree 0, so the determinant of the map's Jacobian is phi^d. The gradient of log phi is
-        exact where max_i |u_i| >= 1e-3, keeps the size that it has there nearer to 0, and counts as 0 at 0.
+        exact for max_i |u_i| >= 1e-3. Nearer to 0 it stops growing, and at 0 it is 0.
 
         Args:
             unit_ball: measure in unit-ball coordinates, see `log_reach`. The gauge cancels in them.
@@ -153,7 +153,8 @@ class Ray:
     ) -> Tensor:
         """Log-density (...) of `alpha_map()` for an action from N(mean, diag std^2), each (..., d).
 
-        With respect to volume where the action is feasible, to the boundary's surface measure where it is not.
+        The density is with respect to volume where the action is feasible, and to the boundary's surface measure
+        elsewhere.
 
         Args:
             unit_ball: measure volume and surface in unit-ball coordinates, see `log_reach`.
@@ -182,8 +183,8 @@ class Ray:
     def log_reach(self) -> Tensor:
         """log r (...), with r = |v| / L the distance from the centre to the boundary along the ray; 0 at the centre.
 
-        In unit-ball coordinates y = L(v) v / |v| every set is the unit ball, whatever the state and the units:
-        entropies measured there mean the same everywhere. dy = dv / r^d, so the interior's log-density gains d log r.
+        In unit-ball coordinates y = L(v) v / |v| every set is the unit ball, whatever the state and the units, so
+        entropies can be compared. dy = dv / r^d, so the interior's log-density gains d log r.
         """
         gauge = self._differentiable_gauge()
         square = self.offset.square().sum(-1)
@@ -202,7 +203,7 @@ class Ray:
         return self.action.double().expand_as(self.offset)
 
     def _traced_stretch(self, unit: Tensor) -> Tensor:
-        """phi (...) of the gauge map at `unit`, as a function of all that is differentiated by; 1 at 0."""
+        """phi (...) of the gauge map at `unit`, with gradients by plain autograd; 1 at 0."""
         gauge = (self._gauge_of(unit)[1] * unit).sum(-1)
         at_center = (unit == 0.0).all(-1)
         return torch.where(at_center, 1.0, _largest(unit) / torch.where(at_center, 1.0, gauge))
@@ -223,7 +224,7 @@ class Ray:
 def _unit(offset: Tensor, near: float = 0.0) -> Tensor:
     """The offset u (..., d), divided by max_i |u_i|; 0 at 0.
 
-    Its derivative is that of a division by a fixed number. It grows no more where max_i |u_i| is below `near`.
+    The derivative treats the divisor as a constant, and as at least `near`.
     """
     size = offset.detach().abs().amax(-1, keepdim=True)
     unit = offset.detach() / one_where_zero(size)
@@ -238,7 +239,7 @@ def _largest(unit: Tensor) -> Tensor:
 
 
 def _tanh_ratio(gauge: Tensor) -> Tensor:
-    """tanh(L) / L (...) for plain autograd: by its series near 0, where a difference in the quotient's would cancel."""
+    """tanh(L) / L (...) for plain autograd: by its series near 0, where the quotient's derivative would cancel."""
     small = gauge < 0.01
     square = torch.where(small, gauge, 0.0).square()
     series = 1.0 + square * (-1.0 / 3.0 + square * (2.0 / 15.0 - 17.0 / 315.0 * square))
@@ -249,7 +250,7 @@ def _tanh_ratio(gauge: Tensor) -> Tensor:
 class _Stretch(NamedTuple):
     """Pieces of the gauge map and its density, for actions u.
 
-    phi is evaluated at u / max_i |u_i|, where it is 1 / L: it is the same there, and no square underflows.
+    phi has the same value at u / max_i |u_i|. It is evaluated there, as 1 / L, so that no square underflows.
     """
 
     size: Tensor  # (...) max_i |u_i|

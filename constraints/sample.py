@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 _MARGIN = 1e-6
-"""No step ends nearer to the end of its chord than this share of it, so that rounding keeps the point inside."""
+"""Steps stay this share of the chord away from its ends, so that rounding does not move the point out of the set."""
 _THIN = 1e-9
 """Half the width that a flat set is given, so that its axes span the space."""
 
 
 def uniform(lead: tuple[int, ...], like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Numbers (*lead,) uniform in [0, 1), in float64, on the device of `like`; drawn where the generator is."""
+    """Numbers (*lead,) uniform in [0, 1), in float64, drawn on the generator's device and moved to that of `like`."""
     device = like.device if generator is None else generator.device
     return torch.rand(lead, dtype=torch.float64, device=device, generator=generator).to(like.device)
 
@@ -42,9 +42,9 @@ def hit_and_run(
     """Points (..., count, d) of a convex set, independent of each other and uniform.
 
     A step moves each point to a uniform one on its chord in a random direction (Smith 1984). Uniform points stay
-    uniform, and others become uniform the faster the rounder the set is. So directions are drawn in `round_axes`, and
-    the first points are uniform on their rays from the centre. On simplices, which are the slowest sets known, 4 d (d +
-    4) steps leave means that are wrong by less than 1 % of a standard deviation (measured for d = 2, 6 and 12).
+    uniform; others become uniform, and faster in a rounder set. Directions are therefore drawn in `round_axes`, and the
+    first points are uniform on their rays from the centre. On simplices, which are the slowest sets known, 4 d (d + 4)
+    steps leave means that are wrong by less than 1 % of a standard deviation (measured for d = 2, 6 and 12).
 
     Args:
         gauge: returns L (..., count) of directions (..., count, d) around interior points (..., count, d).
@@ -73,14 +73,14 @@ def hit_and_run(
 def round_axes(oracle: Callable[[Tensor], Tensor], center: Tensor) -> Tensor:
     """Columns (..., d, d): axes in whose coordinates the set is nearly round, however thin it is.
 
-    Each is half the difference of the two points of the set that are furthest apart across all axes before it (Betke
-    and Henk 1993). Those of an ellipse are the axes of a parallelogram around it: it becomes the unit ball.
+    Each axis is half the difference of the two points that are furthest apart in a direction across all earlier axes
+    (Betke and Henk 1993). For an ellipse they are conjugate semi-axes, so that it becomes the unit ball.
     """
     dim = center.shape[-1]
     across = torch.eye(dim, dtype=center.dtype, device=center.device).expand(*center.shape, dim).clone()
     axes = []
     for _ in range(dim):
-        # The projector onto what is orthogonal to all axes so far; its longest column is far from rounding.
+        # `across` projects onto the complement of all axes so far. Its longest column suffers least from rounding.
         longest = across.square().sum(-2).argmax(-1)[..., None, None].expand(*center.shape, 1)
         normal = torch.nn.functional.normalize(across.gather(-1, longest).squeeze(-1), dim=-1)
         axis = (oracle(normal) - oracle(-normal)) / 2.0

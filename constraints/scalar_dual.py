@@ -11,10 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_TINY = 1e-300  # a divisor in the place of 0
-_HUGE = 1e100  # a multiplier in the place of infinity
+_TINY = 1e-300  # replaces a divisor of 0
+_HUGE = 1e100  # replaces an infinite multiplier
 _LEAST_WEIGHT = 1e-30  # counts as 0 but keeps quotients finite
-_LEAST_METRIC = 1e-150  # of a coordinate that jumps; squares of its inverse stay finite
+_LEAST_METRIC = 1e-150  # metric of a coordinate that jumps; squares of its inverse stay finite
 _LEAST_MULTIPLIER = 1e-100  # a Newton step from 0 to below this has no slope
 _JUST_BELOW = 1.0 - 2.0**-52
 _MAX_STEPS = 40  # Newton needs 3 to 10; rows with tied or degenerate gradients up to 30
@@ -26,10 +26,10 @@ class RowProblem:
 
     target and weight >= 0 (..., d); bound >= 0 is a number or (..., 1); top is a number.
 
-    With a multiplier lam on the row, each coordinate stays at `top` until lam reaches `leave`, falls linearly, and
-    stays at 0 from `arrive` on; where metric is 0 it jumps. weight.a falls along lam, so the solution lies between the
-    two of the 2d breakpoints whose weight.a enclose the bound. The breakpoints `leave` lie just before their value, so
-    that interpolation treats a jump like a fall.
+    With a multiplier lam on the row, each coordinate stays at `top` until lam reaches `leave`, then falls linearly to 0
+    at `arrive` and stays there; with metric 0 it jumps. weight.a falls with lam, so the solution lies between the two
+    neighbours among the 2d breakpoints whose values of weight.a enclose the bound. The breakpoints `leave` are set just
+    below their exact values, so that interpolation treats a jump like a fall.
     """
 
     def __init__(self, target: Tensor, weight: Tensor, bound: Tensor | float, top: float = 1.0):
@@ -47,14 +47,14 @@ class RowProblem:
         leave = (self._arrive - width).mul_(_JUST_BELOW)
         turns = torch.cat((leave, self._arrive), -1).clamp_(min=0.0)
         value = (self._shares(turns, over_width) * self._drop).sum(-1)  # weight.a at each breakpoint
-        # lam decides what encloses, not the value: breakpoints far apart may have values equal to rounding.
+        # lam orders the breakpoints, not the value: distant breakpoints may have values that are equal up to rounding.
         over = value > self.bound
         last_over = (turns * over).amax(-1, keepdim=True)
         first_under = turns.masked_fill(over, _HUGE).amin(-1, keepdim=True)
         ends = self._shares(torch.cat((last_over, first_under), -1), over_width)
         start, end = ends.unbind(-2)
         above, below = (ends * self._drop).sum(-1, keepdim=True).unbind(-2)
-        # From below: a coordinate that the row presses against 0 keeps its relative precision.
+        # Interpolate from below: a coordinate that the row presses against 0 keeps its relative precision.
         part = (self.bound - below) / (above - below).clamp_(min=_TINY)
         return RowSolution(self, torch.lerp(end, start, part.clamp_(max=1.0)), above > self.bound)
 
@@ -116,12 +116,12 @@ def minimize_under_ellipse(
     """Minimiser of sum(shift a^2 / 2 - target a) over the problem's set and sum(scale a^2) <= bound.
 
     scale (..., d) >= 0, target >= 0. The minimiser is the problem's solution for the metric shift + mu scale. Returns
-    the minimiser (..., d), that solution, which tells the active constraints, and the ellipse's multiplier mu
-    (..., 1), 0 where the ellipse is not active.
+    the minimiser (..., d), that solution with the active constraints, and the ellipse's multiplier mu (..., 1), 0 if
+    the ellipse is not active.
 
-    The dual function is concave in mu, so the ellipse's value falls along mu. Its root is found by Newton's method on
-    1 / sqrt(value of the free coordinates), which is linear in mu for a sphere, within a bracket. Since
-    scale_i a_i <= target_i / mu, the multiplier is at most |target|_1 / bound.
+    The dual function is concave in mu, so the ellipse's value falls with mu. Within a bracket, Newton's method finds
+    the mu at which it equals the bound. It solves for 1 / sqrt(value of the free coordinates), which is linear in mu
+    for a sphere. Since scale_i a_i <= target_i / mu, the multiplier is at most |target|_1 / bound.
     """
     target = problem.target
     high = target.sum(-1, keepdim=True) / bound
@@ -155,7 +155,7 @@ def minimize_under_ellipse(
         better = (newton > low + _LEAST_MULTIPLIER) & (newton < high)
         following = torch.where(better, newton, torch.where(unsettled, middle, mu))
         step, mu = (following - mu).masked_fill(unsettled, 0.0), following
-        # A GPU does all steps: waiting for its answer costs more than it saves, and no CUDA graph can hold it.
+        # A GPU takes all steps: waiting for its answer costs more than it saves and cannot be part of a CUDA graph.
         if target.is_cpu and not unsettled.any():
             break
     # The last step is so small that its first order is exact.

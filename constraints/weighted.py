@@ -22,9 +22,9 @@ from constraints.jacobian import JacobianProduct, deflated_jacobian
 from constraints.numerics import one_where_zero, root_or_one, safe_sqrt
 from constraints.scalar_dual import RowProblem
 
-_TINY = 1e-300  # the square of a divisor in the place of 0
-_MOST_WRITTEN = 16  # coordinates of a set whose 2^d rows are written out
-_MOST_COMPARED = 12  # the same where all rows are compared with each other at every action
+_TINY = 1e-300  # replaces the square of a divisor of 0
+_MOST_WRITTEN = 16  # most coordinates of a set whose 2^d rows are written out
+_MOST_COMPARED = 12  # most coordinates of a set whose rows are all evaluated at every action
 
 
 class Weights(NamedTuple):
@@ -35,9 +35,9 @@ class Weights(NamedTuple):
 
 
 class _WeightPatterns(Constraint):
-    """Rows pattern_k * weight(obs), all with the same bound > 0, a number or a function. ValueError for another.
+    """Rows pattern_k * weight(obs), all with the same bound, a function or a number > 0 (ValueError for others).
 
-    `penalty` and `explicit` write out all rows; ConstraintError with more than 16 coordinates and 2^d of them.
+    `penalty` and `explicit` write out all rows; ConstraintError if a set of 2^d rows has more than 16 coordinates.
     """
 
     def __init__(self, weight: Coefficients, bound: Bound, dim: int):
@@ -69,7 +69,7 @@ class _WeightPatterns(Constraint):
         return ((weight * action) @ patterns.T - bound) / norm
 
     def _violation(self, at: Weights, action: Tensor) -> Tensor:
-        # The largest of `_excess`, by sums: matrix products round a sample by the size of its batch, and an
+        # The largest of `_excess`, by sums. The rounding of a matrix product depends on the size of the batch, and an
         # environment's check must not depend on the others in its batch.
         weight, bound = at
         patterns = self._row_patterns(action.device)
@@ -81,9 +81,9 @@ class _WeightPatterns(Constraint):
         return safe_sqrt(self._excess(at, action).clamp(min=0.0).square().sum(-1))
 
     def row_problem(self, at: Weights, target: Tensor) -> RowProblem:
-        """The problem of the one row that can hold the projection of `target`, or the oracle's answer for it.
+        """The problem with the one row that can be active at the projection of `target` or its oracle point.
 
-        It is mirrored to the orthant of the target, because the solution never has the opposite sign.
+        It is mirrored so that the target is positive, because no coordinate of the solution has the opposite sign.
         """
         return RowProblem(target.abs(), self._row(at.weight, target).abs(), at.bound)
 
@@ -115,7 +115,7 @@ class _WeightPatterns(Constraint):
         turns = center * direction < 0.0
         crossing = torch.where(turns, -center / direction, 0.0).clamp(max=1e300)
         point = torch.addcmul(center.unsqueeze(-2), crossing.unsqueeze(-1), direction.unsqueeze(-2))
-        # A coordinate that crosses is 0. Its rounding, times a large weight, would exceed the bound.
+        # A coordinate that crosses is exactly 0. Its rounding, times a large weight, would exceed the bound.
         point = point.masked_fill(crossing.unsqueeze(-2) == crossing.unsqueeze(-1), 0.0)
         value = (self._row(weight.unsqueeze(-2), point) * point).sum(-1)
         last = ((value <= bound) * crossing).amax(-1, keepdim=True)
@@ -141,8 +141,8 @@ class WeightedL1(_WeightPatterns):
 class WeightedPositivePart(_WeightPatterns):
     """sum max(w_i a_i, 0) <= bound in the box: 2^d - 1 rows (R+M, H+M, W+M).
 
-    With more than 12 coordinates, `violation` of an action inside the set is that of the nearest of d rows, and not of
-    all: it may be lower, and it is negative all the same. Outside it is exact.
+    With more than 12 coordinates, `violation` of an action inside the set considers d of the rows only. It may then be
+    too low, but it is negative as it should be. Outside the set it is exact.
     """
 
     origin_centered = False
@@ -168,11 +168,11 @@ class WeightedPositivePart(_WeightPatterns):
         return (((weight * action).cumsum(-1) - bound) / norm).amax(-1)
 
     def _center(self, at: Weights) -> Tensor:
-        # Among the rows of all subsets, only prefixes of the weights sorted downwards limit the radius. Many points
-        # attain it; this one is continuous in obs.
+        # Among the rows of all subsets, only prefixes of the weights in descending order limit the radius. Many points
+        # have it; this one is continuous in obs.
         weight, bound = at
         ordered = weight.abs().sort(-1, descending=True).values
-        # Without weights, the quotient is large: the radius is the box's.
+        # If all weights are 0, the quotient is large and the radius is the box's.
         total, norm = ordered.cumsum(-1), ordered.square().cumsum(-1).clamp(min=_TINY).sqrt()
         radius = ((bound + total) / (norm + total)).amin(-1, keepdim=True).clamp(max=1.0)
         room = 1.0 - radius
@@ -229,7 +229,7 @@ class HalfSpace(_WeightPatterns):
 
 
 def _all_patterns(entries: tuple[float, float], dim: int, device: torch.device) -> Tensor:
-    """Every pattern (2^dim, dim) of the two entries; ConstraintError where they are too many to be written out."""
+    """Every pattern (2^dim, dim) of the two entries; ConstraintError if they are too many to be written out."""
     if dim > _MOST_WRITTEN:
         raise ConstraintError(
             f"a set of {dim} coordinates has 2^{dim} rows, and penalty and explicit write them out for at most"
@@ -240,7 +240,7 @@ def _all_patterns(entries: tuple[float, float], dim: int, device: torch.device) 
 
 @functools.lru_cache
 def _cached_patterns(entries: tuple[float, float], dim: int, device: torch.device) -> Tensor:
-    # Whatever the mode of the first caller: autograd takes no tensors that were made in inference mode.
+    # All callers share the tensors, and autograd cannot use tensors that were made in inference mode.
     with torch.inference_mode(False):
         rows = list(itertools.product(entries, repeat=dim))
         return torch.tensor(rows, dtype=torch.float64, device=device)

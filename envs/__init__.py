@@ -1,7 +1,7 @@
 """The paper's 13 tasks as Gymnasium environments: `make("W+M")`, or `gymnasium.make("acrl/W-M-v0")`.
 
-Importing this package registers the tasks with Gymnasium, and so does a new row of `TASKS`. Gymnasium's identifiers
-cannot hold a "+", so there it is written "-".
+Importing this package registers the tasks with Gymnasium; a new row of `TASKS` is registered at once. Gymnasium's
+identifiers cannot contain a "+" and have a "-" instead.
 """
 
 import copy
@@ -45,15 +45,15 @@ def make(
     show_set: bool = False,
     dtype: Any = np.float64,
 ) -> ActionConstrainedEnv:
-    """The environment of `task` (a key of `TASKS`, as "W+M"); see `ActionConstrainedEnv`.
+    """The environment of `task` (a key of `TASKS`, such as "W+M"); see `ActionConstrainedEnv`.
 
-    An infeasible action is refused with `InfeasibleActionError`; with `project` it is projected instead, so
-    that any agent for Gymnasium trains on it as the paper's DPre does. `simulator="pybullet"` runs Reacher on PyBullet,
-    where that is installed. `show_set` draws the feasible set of a two-dimensional action into pictures.
-    `dtype=np.float32` returns observations in that precision; actions are checked at the exact ones all the same.
+    An infeasible action raises `InfeasibleActionError`. With `project` it is projected instead, so that any Gymnasium
+    agent can train as the paper's DPre does. `simulator="pybullet"` runs Reacher on PyBullet, if that is installed.
+    `show_set` draws the feasible set of a two-dimensional action into pictures. `dtype=np.float32` returns observations
+    in that precision; actions are still checked at the exact observations.
 
-    Raises ValueError for an unknown task, and UnavailableError, a ValueError too, for a simulator that the robot does
-    not have or that is not installed.
+    Raises ValueError for an unknown task, and its subclass UnavailableError for a simulator that the robot does not
+    have or that is not installed.
     """
     settings: dict[str, Any] = {"project": project, "render_mode": render_mode, "simulator": simulator}
     settings |= {"show_set": show_set, "dtype": np.dtype(dtype).name}

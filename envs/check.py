@@ -1,4 +1,4 @@
-"""Whether a robot keeps the protocol of `envs.Robot`; the errors name the mistake."""
+"""Checks that a robot keeps the protocol of `envs.Robot`; the errors name the mistake."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 
 from envs.robot import Robot, RobotError, Step
 
-_LARGE_GROUP = 50  # a robot may step many together in another way than a few
+_LARGE_GROUP = 50  # `step_together` may take another path for many robots than for a few
 
 
 def check_class(robot: type[Robot]) -> None:
-    """Raise RobotError if `robot` is no class of a robot, or lacks methods or attributes."""
+    """Raise RobotError if `robot` is not a robot class, or lacks methods or attributes."""
     if not (isinstance(robot, type) and issubclass(robot, Robot)):
         raise RobotError(f"a robot is a class that derives from envs.Robot, got {robot!r}")
     name = robot.__name__
@@ -37,10 +37,10 @@ def check_class(robot: type[Robot]) -> None:
 def check_robot(robot: type[Robot], steps: int = 200) -> None:
     """Raise RobotError, whose message names the mistake, if `robot` does not keep the protocol of `Robot`.
 
-    Several episodes of at most `steps` steps are played with random actions in [-1, 1], many of them at its ends. A
-    class that passes has the attributes, shapes and types of the protocol. Equal random numbers and actions give equal
-    bits: in two robots side by side, after other episodes, from a saved state, and in `step_together`. The arrays that
-    it returns and those that it gets belong to the caller.
+    The check plays several episodes of at most `steps` steps with random actions in [-1, 1], many of them at -1 or 1.
+    It tests the attributes, shapes and types of the protocol. Equal random numbers and actions must give equal bits: in
+    two robots side by side, after other episodes, from a saved state, and in `step_together`. The robot must copy the
+    arrays that it is given and those that it returns.
     """
     check_class(robot)
     steps = min(steps, robot.max_episode_steps)
@@ -51,7 +51,7 @@ def check_robot(robot: type[Robot], steps: int = 200) -> None:
     check.states(first)
     check.together()
     for _ in range(2):
-        check.call("close", check.new().close)  # of a robot without an episode
+        check.call("close", check.new().close)  # before the first episode
     machine = check.new()
     check.call("reset", machine.reset, _random_numbers())
     for _ in range(2):
@@ -71,7 +71,7 @@ class _Check:
         self.actions = [action.astype((np.float32, np.float64)[k % 2]) for k, action in enumerate(actions)]
 
     def call(self, method: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """The answer of a method of the robot; an error of its code as a RobotError."""
+        """Call a method of the robot and return the result. An error in its code becomes a RobotError."""
         try:
             return function(*arguments)
         except Exception as error:  # the robot is the user's own code
@@ -85,7 +85,7 @@ class _Check:
         raise RobotError(f"{self.name}{message}")
 
     def formats(self) -> list[Step]:
-        """Check what reset and step return, in the first episode; return its steps, that of the reset included."""
+        """Check what reset and step return in a first episode. Return its steps, of which the reset is the first."""
         machine = self.new()
         rng = _random_numbers()
         obs = self.call("reset", machine.reset, rng)
@@ -136,7 +136,7 @@ class _Check:
             self.fail(f".{method}() returns an observation that is not finite: {obs}")
 
     def play(self, machine: Robot, actions: Sequence[np.ndarray], spoil: bool = False) -> list[Step]:
-        """Step `machine` until the episode terminates; with `spoil`, overwrite what it returned and got."""
+        """Step `machine` until the episode terminates; with `spoil`, overwrite the arrays given and returned."""
         steps: list[Step] = []
         for action in actions:
             given = action.copy()
@@ -159,7 +159,7 @@ class _Check:
     def begin(self, machine: Robot, seed: int = 0, spoil: bool = False) -> Step:
         rng = _random_numbers(seed)
         obs = self.call("reset", machine.reset, rng)
-        step: Step = (obs.copy(), rng.random(), False, {})  # that number tells how many were drawn
+        step: Step = (obs.copy(), rng.random(), False, {})  # this number shows how many were drawn before
         if spoil:
             obs[:] = np.nan
         return step
@@ -195,7 +195,7 @@ class _Check:
         machine.close()
 
     def states(self, first: list[Step]) -> None:
-        """Check that a saved state continues in every bit, in a new robot and in one that has been elsewhere."""
+        """Check that an episode continues bit for bit from a saved state, in a new robot and in a used one."""
         machine, used = self.new(), self.new()
         self.begin(machine)
         kept = self.call("get_state", machine.get_state)
@@ -230,7 +230,7 @@ class _Check:
         machine.close(), used.close()
 
     def together(self) -> None:
-        """Check that `step_together` does what `step` does."""
+        """Check that `step_together` returns the same bits as `step`."""
         if self.robot.step_together.__func__ is Robot.step_together.__func__:  # type: ignore[attr-defined]
             return
         for size in (1, 2, 3, _LARGE_GROUP):

@@ -30,14 +30,18 @@ class InfeasibleActionError(ValueError):
 
 
 def allowed_violation(constraint: Constraint, obs: torch.Tensor, violation: float) -> torch.Tensor:
-    """The largest violations (...) that executed actions may have at obs (..., n), where the largest is `violation`."""
+    """The largest violation (...) that an executed action may have at obs (..., n).
+
+    `violation` is the largest one of the actions in question. Up to 1e-6, the least possible violation need not be
+    computed.
+    """
     if violation > TOLERANCE and constraint.on_empty == "least":
         return TOLERANCE + constraint.least_violation(obs).double()
     return torch.full(obs.shape[:-1], TOLERANCE, dtype=torch.float64, device=obs.device)
 
 
 def find_task(name: str) -> Task:
-    """The `Task` called `name`; ValueError with the choices and the closest name where there is none."""
+    """The `Task` called `name`; ValueError with the choices and the closest name if there is none."""
     return TASKS[known_name("task", name, TASKS)]
 
 
@@ -61,13 +65,13 @@ def make_robot(name: str, task: Task, simulator: str | None = None) -> Robot:
 def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.ndarray] | np.ndarray) -> list[Any]:
     """Step each `ActionConstrainedEnv` of `envs` with its action (d,) of `actions`, all under one violation check.
 
-    Returns a list: what `step` returns or, for an action that it refuses, the InfeasibleActionError that it raises;
-    the others are executed all the same. Each environment does what it would do alone, in every bit. Robots of one
-    class take the step in one call.
+    Returns a list. An item is what `step` returns or, for a refused action, the InfeasibleActionError that `step`
+    raises; the other actions are executed all the same. Each environment behaves bit for bit as it would alone. Robots
+    of one class take the step in one call.
 
-    Raises gymnasium.error.ResetNeeded where an environment needs a reset, and ValueError for environments of different
-    constraints and for one given twice, whose second action would be checked at a past observation. None has then been
-    stepped.
+    Raises gymnasium.error.ResetNeeded if an environment needs a reset, and ValueError for environments of different
+    constraints and for an environment given twice, whose second action would be checked at a past observation. No
+    environment has been stepped then.
     """
     if len(set(map(id, envs))) < len(envs) or any(env.constraint is not envs[0].constraint for env in envs):
         raise ValueError("step_together() takes different environments of one constraint")
@@ -94,7 +98,7 @@ def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.nda
 
 
 def _all_well_formed(envs: Sequence[ActionConstrainedEnv], actions: Any) -> bool:
-    """Whether each action is well-formed and each environment ready, asked of all at once. It may say no wrongly."""
+    """Fast test whether all actions are well-formed and all environments ready; only False may be wrong."""
     if not envs or not isinstance(actions, np.ndarray) or actions.shape != (len(envs), envs[0].constraint.dim):
         return False
     return all(env._obs is not None for env in envs) and bool(np.isfinite(actions).all())
@@ -103,20 +107,20 @@ def _all_well_formed(envs: Sequence[ActionConstrainedEnv], actions: Any) -> bool
 class ActionConstrainedEnv(gymnasium.Env):
     """A robot under the action constraint of one of the paper's tasks.
 
-    Observations (n,) are of `dtype`, float64 or float32, and actions (d,) lie in [-1, 1]. Before an action is
-    executed, its violation is computed in float64 at the robot's own observation, which is float64 for every `dtype`.
-    An action whose violation is above 1e-6 is refused. With `project`, an action outside the set is replaced by its
-    projection instead, and `info["executed_action"]` holds what was executed (float64, (d,)). The robot's time limit
-    truncates. `simulator` chooses among the robot's simulators. With `show_set`, pictures show the last action of a
-    two-dimensional action space in the set that was feasible for it.
+    Observations (n,) are of `dtype`, float64 or float32, and actions (d,) lie in [-1, 1]. Before an action is executed,
+    its violation is computed in float64 at the robot's own observation, which is float64 for every `dtype`. An action
+    whose violation is above 1e-6 is refused. With `project`, an action outside the set is replaced by its projection
+    instead, and `info["executed_action"]` holds the executed action (float64, (d,)). The robot's time limit truncates
+    episodes. `simulator` chooses among the robot's simulators. With `show_set`, which needs a two-dimensional action
+    space, pictures show the last action in the set that was feasible for it.
 
-    An environment can be copied and pickled, by cloudpickle as well, at any moment; the copy goes on as the original
-    does, in every bit. After the end of an episode, step() raises gymnasium.error.ResetNeeded. After close(), reset(),
+    An environment can be copied and pickled (also by cloudpickle) at any moment; the copy continues bit for bit as the
+    original does. After the end of an episode, step() raises gymnasium.error.ResetNeeded. After close(), reset(),
     step() and render() raise gymnasium.error.ClosedEnvironmentError.
 
-    Attributes: `constraint`; `largest_violation` (float) over all executed actions since construction, -inf
-    before the first; `executed_actions` (int), their number; `elapsed_steps` (int) of the current episode;
-    `max_episode_steps` (int, None for no limit), the robot's or what `gymnasium.make` was given.
+    Attributes: `constraint`; `largest_violation` (float) over all executed actions since construction, -inf before the
+    first; `executed_actions` (int), their number; `elapsed_steps` (int) of the current episode; `max_episode_steps`
+    (int, None for no limit), the robot's or the one given to `gymnasium.make`.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -149,11 +153,11 @@ class ActionConstrainedEnv(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.robot.obs_dim,), self._dtype)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.robot.action_dim,), np.float32)
         self.largest_violation, self.executed_actions, self.elapsed_steps = -np.inf, 0, 0
-        # A copy of the observation, as callers may write into theirs; None when no step can follow.
+        # A copy of the observation, because callers may write into theirs; None when no step can follow.
         self._obs: np.ndarray | None = None
         self._closed = False
-        # Of the last episode: the state of the random numbers before its reset, and its actions so far. Actions are
-        # kept only where the robot has no state of its own.
+        # The last episode: the state of the random numbers before its reset, and its actions so far. Actions are kept
+        # only if the robot has no state of its own.
         self._start: Mapping[str, Any] | None = None
         self._actions: list[np.ndarray] = []
         self._keeps_actions = False
@@ -182,11 +186,10 @@ class ActionConstrainedEnv(gymnasium.Env):
         return outcome
 
     def get_state(self) -> dict[str, Any]:
-        """Everything that `set_state`, also in another process, needs to continue bit for bit: a dict of numbers, text
-        and tensors.
+        """The state from which `set_state` continues bit for bit, in any process: a dict of numbers, text and tensors.
 
-        An episode in progress is kept as the robot's own state. For a robot that has none, it is kept as the random
-        numbers before its reset and the actions since. Of an episode that is over only the random numbers are left.
+        An episode in progress is kept as the robot's own state. If the robot has none, the random numbers before its
+        reset and the actions since are kept. Between episodes, the random numbers are enough.
         """
         self._refuse_closed("get_state")
         in_episode = self._obs is not None
@@ -206,7 +209,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go back to what `get_state` described; if the saved episode had ended, call reset() next.
+        """Restore a state from `get_state`; if its episode had ended, call reset() next.
 
         A robot without a state of its own repeats an episode in progress. Raises ValueError for the state of another
         robot or simulator.
@@ -222,7 +225,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         elif state["in_episode"]:
             self._start, self._keeps_actions = self.np_random.bit_generator.state, True
             self._actions = [] if state["actions"] is None else list(state["actions"].numpy())
-            if state.get("single") is not None:  # they are in one array of the wider precision
+            if state.get("single") is not None:  # the array has the wider precision
                 precisions = [np.float32 if single else np.float64 for single in state["single"]]
                 self._actions = [a.astype(p) for a, p in zip(self._actions, precisions, strict=True)]
             self._obs = self._repeat()
@@ -250,7 +253,7 @@ class ActionConstrainedEnv(gymnasium.Env):
 
     def __getstate__(self) -> dict[str, Any]:
         for owner in (self, self.action_space, self.observation_space):
-            _ = owner.np_random  # made now where there is none, so that the copy has the same
+            _ = owner.np_random  # created now if need be, so that the copy has the same one
         content = {name: value for name, value in vars(self).items() if name not in ("robot", "constraint")}
         in_simulator = self._start is not None and not self._closed
         return content | {"robot": self.robot.get_state() if in_simulator else None}
@@ -271,7 +274,7 @@ class ActionConstrainedEnv(gymnasium.Env):
             self.np_random.bit_generator.state = now
 
     def _repeat(self) -> np.ndarray:
-        """Play the last episode once more from its start and by its actions; return the observation."""
+        """Repeat the last episode from its start with its actions; return the observation."""
         self.np_random.bit_generator.state = self._start
         obs = self.robot.reset(self.np_random)
         for action in self._actions:
@@ -292,7 +295,7 @@ class ActionConstrainedEnv(gymnasium.Env):
         return (center + direction / self.constraint.gauge(repeated, direction, center).unsqueeze(-1)).numpy()
 
     def _well_formed(self, action: np.ndarray) -> np.ndarray | InfeasibleActionError:
-        """`action` as an array (d,) of finite numbers, or the InfeasibleActionError that says why it is none."""
+        """`action` as an array (d,) of finite numbers, or the InfeasibleActionError that says what is wrong."""
         if self._obs is None:
             self._refuse_closed("step")
             over = "the episode is over; " if self._start is not None else ""
@@ -307,10 +310,10 @@ class ActionConstrainedEnv(gymnasium.Env):
 
     @torch.no_grad()  # coefficients may be learned
     def _admit(self, action: np.ndarray, violation: float) -> np.ndarray | InfeasibleActionError:
-        """What the robot executes for a well-formed `action`, or the InfeasibleActionError that refuses it.
+        """The action to execute for a well-formed `action`, or the InfeasibleActionError that refuses it.
 
-        That is `action` itself (in its own precision) or its projection; `violation` is that of `action` at the current
-        observation.
+        It is `action` itself (in its own precision) or its projection. `violation` is the violation of `action` at the
+        current observation.
         """
         if self.project and violation > 0:
             obs, exact = torch.from_numpy(self._obs), torch.from_numpy(action.astype(np.float64))
@@ -348,7 +351,7 @@ class ActionConstrainedEnv(gymnasium.Env):
 
 
 class GivenTimeLimit(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
-    """Tells an `ActionConstrainedEnv` the time limit that `gymnasium.make` was given, which may be a longer one."""
+    """Sets the time limit of an `ActionConstrainedEnv` to that given to `gymnasium.make`, which may be longer."""
 
     def __init__(self, env: Any):
         gymnasium.utils.RecordConstructorArgs.__init__(self)

@@ -45,8 +45,8 @@ def draw_arm(elbow: Point, tip: Point, target: Point, limit: float) -> np.ndarra
 def draw_set(picture: np.ndarray, boundary: np.ndarray, action: np.ndarray | None) -> np.ndarray:
     """A copy of `picture` (h, w, 3) with a feasible set in its upper right corner.
 
-    `boundary` (k, 2) are points around the set, in the order in which they follow one another; `action` (2,) is the
-    last executed action, None before the first. The frame is the box [-1, 1]^2, with the first coordinate to the right.
+    `boundary` (k, 2) are points around the set, in order; `action` (2,) is the last executed action, None before the
+    first. The frame is the box [-1, 1]^2, with the first coordinate to the right.
     """
     side, margin = 128, 10
     image = Image.new("RGB", (side * _FINE, side * _FINE), _PAPER)

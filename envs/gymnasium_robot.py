@@ -16,10 +16,10 @@ from envs.robot import Robot, Step
 
 
 class _Wrapped(Robot):
-    """What all classes that `GymnasiumRobot` makes have in common."""
+    """The base class of all classes that `GymnasiumRobot` makes."""
 
     identifier: str
-    """Of the environment, for `gymnasium.make`."""
+    """The environment's identifier for `gymnasium.make`."""
     render_mode: str | None
     """"rgb_array", or None for an environment without pictures."""
 
@@ -37,7 +37,7 @@ class _Wrapped(Robot):
         return self._start(int(rng.integers(2**31)))
 
     def step(self, action: np.ndarray) -> Step:
-        """Execute `action` (action_dim,), of which -1 and 1 are the ends of the environment's box."""
+        """Execute `action` (action_dim,), scaled from [-1, 1] to the environment's box."""
         exact = np.array(action, np.float64)
         self._actions.append(exact)
         box, scaled = self._box, self._middle + self._half * exact
@@ -54,8 +54,8 @@ class _Wrapped(Robot):
     def get_state(self) -> np.ndarray:
         """The seed of the episode and its actions (1 + steps * action_dim,).
 
-        An environment may keep anything anywhere. MuJoCo's own state, for one, lacks the contact forces that Ant
-        observes, and the positions of bodies from which Ant's next reward is computed.
+        A simulator's state may be incomplete. MuJoCo's, for example, lacks the contact forces that Ant observes and the
+        body positions from which Ant's next reward is computed.
         """
         return np.concatenate(([float(self._seed)], *self._actions))  # the seed is below 2^31, so the float is exact
 
@@ -88,15 +88,15 @@ class _Wrapped(Robot):
 
 @functools.cache
 def GymnasiumRobot(identifier: str) -> type[Robot]:  # noqa: N802
-    """The class of robots that are the Gymnasium environment `identifier`, such as "Ant-v5", for a row of `TASKS`.
+    """A robot class, for a row of `TASKS`, that runs the Gymnasium environment `identifier`, such as "Ant-v5".
 
     Its actions in [-1, 1] are scaled to the environment's box, and its observations are flattened to (obs_dim,). The
-    environment decides when an episode terminates, and its time limit is `max_episode_steps`. A saved episode is its
-    seed and its actions, so that the environment has to be deterministic given both; `envs.check_robot` tests it.
+    environment decides when an episode terminates, and its time limit is `max_episode_steps`. A saved episode consists
+    of its seed and its actions, so the environment must be deterministic given both; `envs.check_robot` tests this.
     Derive from the class to change an attribute, such as `hyperparameters`.
 
-    Raises ValueError for an environment with other spaces, an infinite box of actions or no time limit, and Gymnasium's
-    own errors for one that does not exist or is not installed.
+    Raises ValueError if observations or actions are not a Box, if actions are not bounded floats, or if there is no
+    time limit. Gymnasium raises its own errors for an environment that does not exist or is not installed.
     """
     env = _make(identifier)
     try:
@@ -125,7 +125,7 @@ def GymnasiumRobot(identifier: str) -> type[Robot]:  # noqa: N802
 
 
 def _make(identifier: str, render_mode: str | None = None) -> gymnasium.Env:
-    # Entering it imports MuJoCo. Gymnasium's own import fails where MUJOCO_GL names an absent library.
+    # Entering `silent_mujoco` imports MuJoCo. Gymnasium's own import fails if MUJOCO_GL names an absent library.
     quiet = silent_mujoco() if importlib.util.find_spec("mujoco") else contextlib.nullcontext()
     with quiet:
         return gymnasium.make(identifier, render_mode=render_mode, disable_env_checker=True)

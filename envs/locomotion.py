@@ -22,9 +22,9 @@ from envs.threads import call_each
 
 
 def import_mujoco() -> Any:
-    """The package mujoco, also where MUJOCO_GL names an OpenGL library that is not installed.
+    """The package mujoco, even if MUJOCO_GL names an OpenGL library that is not installed.
 
-    The package loads that library when it is imported, and fails without it. Only pictures need it.
+    The import loads that library and fails without it, although only pictures need it.
     """
     try:
         return importlib.import_module("mujoco")
@@ -43,7 +43,7 @@ def import_mujoco() -> Any:
 
 @contextmanager
 def silent_mujoco() -> Iterator[None]:
-    """Hide warnings: half_cheetah.xml makes MuJoCo print one and leave a MUJOCO_LOG.TXT where the process runs."""
+    """Hide warnings: half_cheetah.xml makes MuJoCo print one and write a MUJOCO_LOG.TXT to the current folder."""
     mujoco = import_mujoco()
     warning_handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
@@ -55,7 +55,7 @@ def silent_mujoco() -> Iterator[None]:
 
 @functools.cache
 def _load_model(file: str) -> Any:
-    """The MuJoCo model of `file`, which robots share: half a megabyte each would crowd the processor's cache."""
+    """The MuJoCo model of `file`. Robots share it: half a megabyte each would fill the processor's cache."""
     mujoco = import_mujoco()
     # Gymnasium's own path without its `envs.mujoco` package, which would load every MuJoCo task
     assets = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
@@ -71,7 +71,7 @@ class _Locomotion(SimulatedRobot):
     """
 
     max_episode_steps = 1000
-    # filled by each robot
+    # set by each robot
     model_file: str
     frame_skip: int
     ctrl_cost_weight: float
@@ -106,7 +106,7 @@ class _Locomotion(SimulatedRobot):
 
     @classmethod
     def step_together(cls, robots: Sequence[Robot], actions: Sequence[np.ndarray]) -> list[Step]:
-        """`step` of each, with the same bits. MuJoCo moves the robots in as many threads as PyTorch computes with."""
+        """`step` of each robot, with the same bits. MuJoCo runs in as many threads as PyTorch uses."""
         ours = cast("Sequence[_Locomotion]", robots)
         starts = [robot._start(action) for robot, action in zip(ours, actions, strict=True)]
         call_each([robot._simulate for robot in ours], torch.get_num_threads())
@@ -122,7 +122,7 @@ class _Locomotion(SimulatedRobot):
         return float(self._qpos[0])
 
     def _simulate(self) -> None:
-        """MuJoCo's part of a step. It runs beside other Python threads."""
+        """MuJoCo's part of a step. It runs in parallel with other Python threads."""
         self._mujoco.mj_step(self.model, self.data, nstep=self.frame_skip)
 
     def _end(self, x_before: float, action_squared: np.floating) -> Step:
@@ -149,7 +149,7 @@ class _Locomotion(SimulatedRobot):
     def render(self, width: int = 480, height: int = 480) -> np.ndarray:
         """Picture (height, width, 3), uint8, from the side, the camera following the robot.
 
-        Raises RuntimeError where no OpenGL backend works.
+        Raises RuntimeError if no OpenGL backend works.
         """
         if self._picture is None:
             self._picture = _Picture(self._mujoco, self.model, width, height)
@@ -274,9 +274,9 @@ class Walker2d(_Upright):
 def _gl_backend() -> str:
     """Name of the OpenGL backend to use: MUJOCO_GL if set, otherwise one that fits this machine.
 
-    Chosen once and before anything is loaded: PyOpenGL cannot change its platform afterwards. It is chosen
-    here because `import mujoco` itself fails where MUJOCO_GL names a backend whose library is missing, and
-    training needs none.
+    The first choice must be right, because PyOpenGL cannot change its platform later. It is made here and not at
+    import: `import mujoco` fails if MUJOCO_GL names a backend whose library is missing, and training needs no backend.
+    RuntimeError if there is neither a display nor a library for rendering without one.
     """
     chosen = os.environ.get("MUJOCO_GL", "").lower()
     if chosen:
@@ -308,9 +308,9 @@ class _Picture:
                 f"the OpenGL backend {backend!r} does not work on this machine ({error!r}); without a "
                 "display, install libegl1 or libosmesa6 and set MUJOCO_GL to 'egl' or 'osmesa'"
             ) from error
-        # called once, by close() or when the object goes
+        # called once, by close() or when the object is deleted
         self.close = weakref.finalize(self, _free, self._gl, self._context)
-        self.close.atexit = False  # OpenGL may be gone before, and the process frees its memory anyway
+        self.close.atexit = False  # at exit OpenGL may be gone already, and the process frees its memory anyway
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._mujoco, self._model = mujoco, model
         self._scene, self._option = mujoco.MjvScene(model, maxgeom=1000), mujoco.MjvOption()

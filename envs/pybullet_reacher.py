@@ -36,7 +36,7 @@ def _silent_import() -> Iterator[None]:
 class PyBulletReacher(SimulatedRobot):
     """One arm in a physics client of its own; observations and actions are those of `Reacher`.
 
-    Raises UnavailableError where PyBullet is not installed.
+    Raises UnavailableError if PyBullet is not installed.
     """
 
     obs_dim, action_dim = Reacher.obs_dim, Reacher.action_dim
@@ -57,7 +57,7 @@ class PyBulletReacher(SimulatedRobot):
         client = bullet.connect(bullet.DIRECT)
         if client < 0:
             raise RuntimeError("PyBullet could not start another physics client in this process")
-        # called once: by close(), when the robot goes, or when the process ends
+        # called once: by close(), when the robot is deleted, or when the process ends
         self._disconnect = weakref.finalize(self, bullet.disconnect, client)
         self._own_client = client
         bodies = bullet.loadMJCF(

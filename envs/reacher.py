@@ -60,7 +60,7 @@ _INVERSE_FORE_INERTIA = 1.0 / _FORE_INERTIA
 _FORE_RATIO = _FORE_MOMENT * _INVERSE_FORE_INERTIA
 _FREE_MASS = _FORE_MASS - _FORE_MOMENT * _FORE_RATIO  # what a push across the forearm at joint 1 has to move
 
-_TINY = np.finfo(np.float64).eps  # Bullet takes the length of a shorter vector as 0
+_TINY = np.finfo(np.float64).eps  # Bullet takes the length of a vector as 0 if its square is below this
 _CORRECTED = 0.2  # Bullet's ERP: the share of a limit's error that a step corrects
 _DEEPEST_CORRECTED = -_single(0.04)  # past this, Bullet stops the joint and does not push it back
 
@@ -74,7 +74,7 @@ class Arithmetic(NamedTuple):
     cos: Callable[[Any], Any]
     sin: Callable[[Any], Any]
     sqrt: Callable[[Any], Any]
-    root: Callable[[Any], Any]  # the square root as Bullet takes it of squared lengths
+    root: Callable[[Any], Any]  # the square root, as Bullet applies it to squared lengths
     clip: Callable[[Any, float, float], Any]
     stop: Callable[..., Any]  # `_stop` where joint 1 is at its limit
 
@@ -82,7 +82,7 @@ class Arithmetic(NamedTuple):
 def _accelerate(
     half_cos: Value, half_sin: Value, w1: Value, w2: Value, t1: Value, t2: Value, root: Callable[[Value], Value]
 ) -> tuple[Value, ...]:
-    """Joint accelerations, and what an impulse on joint 1 needs: (a1, a2, 1 / inertia at joint 0, rx, c).
+    """Joint accelerations, and the values that an impulse on joint 1 needs: (a1, a2, 1 / inertia at joint 0, rx, c).
 
     `half_cos` and `half_sin` belong to half the angle of joint 1, `w1`, `w2` are joint speeds, `t1`, `t2` torques.
     Floats and arrays take the same operations in the same order, and so give the same bits. All vectors are in the
@@ -143,8 +143,8 @@ def _accelerate(
 def _stop(q2: float, w1: float, w2: float, inverse: float, rx: float, c: float) -> tuple[float, float]:
     """The joint speeds after the impulse of the limit on joint 1, for |q2| >= 3.
 
-    An impulse only pushes inward. It stops the joint and, up to 0.04 rad past the limit, takes back a fifth of the
-    error in a step. `inverse`, `rx`, `c` come from `_accelerate`.
+    An impulse only pushes inward. It stops the joint and, up to 0.04 rad past the limit, corrects a fifth of the error
+    in each step. `inverse`, `rx`, `c` come from `_accelerate`.
     """
     side, gap = math.copysign(1.0, q2), LIMIT - abs(q2)
     # Responses of the joint speeds to a unit impulse on joint 1.
@@ -206,7 +206,7 @@ ARRAYS = Arithmetic(
 # ---------------------------------------------------------------- the robot
 
 MANY = 40
-"""From so many arms on, arrays are faster than a loop over floats."""
+"""From this number of arms on, arrays are faster than a loop over floats."""
 
 
 class State(NamedTuple):
@@ -226,7 +226,7 @@ class State(NamedTuple):
     seen_y: Any
 
     def fingertip(self, arithmetic: Arithmetic) -> tuple[Any, Any]:
-        """Where the fingertip is."""
+        """Position (x, y) of the fingertip, without the delay."""
         cos, sin, total = arithmetic.cos, arithmetic.sin, self.q1 + self.q2
         return _UPPER * cos(self.q1) + _FORE * cos(total), _UPPER * sin(self.q1) + _FORE * sin(total)
 

@@ -1,4 +1,4 @@
-"""What a task is, and the table that checks tasks and registers them with Gymnasium."""
+"""The definition of a task, and the table that checks tasks and registers them with Gymnasium."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ _NOT_NAMES = {"all", "figures", "tables"}  # a word of the command line, and fol
 
 @dataclass(frozen=True)
 class Task:
-    """`robot`: its simulation; `constraint`: the feasible set, the action box included; `description` in
-    words and `formula` in LaTeX: that set without the box; `steps`: environment steps of a training run.
+    """A robot under an action constraint, with the length of a training run.
 
-    Raises TypeError or ValueError for parts of another kind or that do not fit together.
+    `robot` is a class. `constraint` is the feasible set, the action box included; `description` in words and `formula`
+    in LaTeX give it without the box. `steps` are the environment steps of a training run. TypeError or ValueError if a
+    part has the wrong type or does not fit the others.
     """
 
     robot: type[Robot]
@@ -55,7 +56,7 @@ class Task:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A task of the table is pickled as its name, with its definition for a process that does not know the name."""
+        """Pickle a task of the table as its name, with its definition for a process that does not know the name."""
         name = next((name for name, task in TASKS.items() if task is self), None)
         parts = self.robot, self.constraint, self.description, self.formula, self.steps
         return _find_or_make, (name, cloudpickle.dumps(parts))
@@ -73,9 +74,9 @@ def gymnasium_id(name: str) -> str:
 class Tasks(NameTable[Task]):
     """The table of tasks, name -> `Task`. A new row is checked and registered with Gymnasium.
 
-    A name consists of letters, digits and the signs + - _ . and begins with a letter or a digit. Raises ValueError
-    for another name and for one that is taken, by itself or by its identifier, and TypeError for what is no `Task`.
-    `del TASKS[name]` makes a name free.
+    A name consists of letters, digits and the signs + - _ . and begins with a letter or a digit. Raises ValueError for
+    any other name and if the name or its Gymnasium identifier is taken, and TypeError if the value is not a `Task`.
+    `del TASKS[name]` frees the name.
     """
 
     def __init__(self) -> None:
@@ -95,7 +96,7 @@ class Tasks(NameTable[Task]):
         if before is not None and before.kwargs.get("task") != name:
             other = next((other for other in self if gymnasium_id(other) == identifier), "another package")
             raise ValueError(f"the task {name} would have the identifier {identifier}, which {other} has already")
-        gymnasium.registry.pop(identifier, None)  # this row, where the module is loaded for the second time
+        gymnasium.registry.pop(identifier, None)  # the same row, if its module is loaded a second time
         gymnasium.register(
             identifier,
             entry_point="envs.constrained:ActionConstrainedEnv",
@@ -111,4 +112,4 @@ class Tasks(NameTable[Task]):
 
 
 TASKS = Tasks()
-"""The tasks that there are; `envs.tasks` enters the paper's."""
+"""All tasks; `envs.tasks` adds the paper's."""

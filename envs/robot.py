@@ -1,4 +1,4 @@
-"""What a robot of a task is: the protocol that every simulation follows."""
+"""The protocol that every robot of a task follows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 Step = tuple[np.ndarray, float, bool, dict[str, Any]]
-"""What a step returns: observation (n,), reward, whether the episode ended for good, info."""
+"""What a step returns: observation (n,), reward, whether the episode terminated, info."""
 
 
 class UnavailableError(ValueError):
@@ -27,7 +27,7 @@ class Robot(ABC):
     arrays, which the caller may keep and change. The environment around a robot checks actions, counts steps and ends
     an episode after `max_episode_steps`; a robot does none of that. `envs.check_robot` tests all this.
 
-    A robot is made without arguments. A copied or pickled environment makes a new robot and gives it the state of the
+    The constructor takes no arguments. A copied or pickled environment makes a new robot and gives it the state of the
     old one, or repeats the actions of the episode.
     """
 
@@ -35,19 +35,19 @@ class Robot(ABC):
     action_dim: int
     max_episode_steps: int
     fps: int
-    """Steps in a second of simulated time, at which a video shows real time."""
+    """Steps per second of simulated time: the frame rate of a video in real time."""
     hyperparameters: str = "Others"
-    """The group of robots in the paper's table of hyperparameters whose values algorithms take."""
+    """The group of robots in the paper's table of hyperparameters. Algorithms use the values of this group."""
     simulators: Mapping[str, str] = {}
     """The simulators among which a user can choose: name -> "module:class", imported when chosen. The first is this
-    class itself; a robot without a choice has none. A class that derives from a robot does not inherit them."""
+    class itself; a robot without a choice has no entries. Subclasses do not inherit the entries."""
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         if "simulators" not in vars(cls):
-            cls.simulators = {}  # those of the base class would run the base class
+            cls.simulators = {}  # the base class's entries would run the base class
         if "step" in vars(cls) and "step_together" not in vars(cls):
-            # A faster way to take the base class's step is not one to take this step.
+            # The inherited step_together would take the base class's step.
             cls.step_together = classmethod(Robot.step_together.__func__)  # type: ignore[assignment, attr-defined]
 
     @abstractmethod
@@ -56,18 +56,18 @@ class Robot(ABC):
 
     @abstractmethod
     def step(self, action: np.ndarray) -> Step:
-        """Execute `action` (action_dim,), float32 or float64, in [-1, 1]; return what `Step` says."""
+        """Execute `action` (action_dim,), float32 or float64, in [-1, 1]; return a `Step`."""
 
     @classmethod
     def step_together(cls, robots: Sequence[Robot], actions: Sequence[np.ndarray]) -> list[Step]:
-        """Step each of `robots`, all of this class, with its action; what `step` of each would return, in every bit.
+        """Step each of `robots`, all of this class, with its action; return bit for bit what `step` of each would.
 
-        Override this where one call for all is faster than a loop.
+        Override this if one call for all is faster than a loop.
         """
         return [robot.step(action) for robot, action in zip(robots, actions, strict=True)]
 
     def get_state(self) -> np.ndarray | None:
-        """The robot's state in an episode as float64 numbers (k,), from which `set_state` continues in every bit.
+        """The robot's state in an episode as float64 numbers (k,), from which `set_state` continues bit for bit.
 
         None, the default, means that there is no such state. A checkpoint then keeps the actions of the episode, and a
         resumed run repeats them.
@@ -75,7 +75,7 @@ class Robot(ABC):
         return None
 
     def set_state(self, state: np.ndarray) -> np.ndarray:
-        """Continue from `state` (k,), which `get_state` returned, maybe in another process; return its observation."""
+        """Continue from `state` (k,) of `get_state`, maybe of another process; return its observation (obs_dim,)."""
         raise TypeError(f"{type(self).__name__} has no state to set")
 
     @abstractmethod
@@ -84,14 +84,14 @@ class Robot(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Free what the simulator holds; closing twice is harmless. Nothing is asked of a closed robot."""
+        """Free the simulator; closing twice must be harmless. A closed robot is not used again."""
 
 
 class SimulatedRobot(Robot):
     """A robot whose simulator cannot be pickled. A copy is a new robot of its class in the same state.
 
-    A subclass calls `_built` at the end of its constructor. What the constructor sets up is set up anew in a copy;
-    attributes that come later are copied.
+    A subclass calls `_built` at the end of its constructor. A copy runs the constructor, which sets the early
+    attributes anew; attributes added later are copied.
     """
 
     def _built(self) -> None:

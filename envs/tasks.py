@@ -1,8 +1,7 @@
 """The paper's 13 tasks (Table "Experiment environments and constraints"): a robot and a constraint each.
 
-Every index into an observation stands here and nowhere else. Angles and velocities are as the observation
-reports them: Hopper and Walker2d clip velocities to +-10, Reacher's velocities are 0.1 x rad/s, and its
-theta_2 is the joint angle divided by 3.
+All indices into observations are in this file. Angles and velocities are as the observation reports them: Hopper and
+Walker2d clip velocities to +-10, Reacher's velocities are 0.1 x rad/s, and its theta_2 is the joint angle divided by 3.
 """
 
 from __future__ import annotations

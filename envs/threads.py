@@ -1,4 +1,4 @@
-"""Calls that run beside each other: simulators in C release Python's lock while they compute."""
+"""Calls that run in parallel threads: simulators in C release Python's lock while they compute."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 FEWEST = 2
-"""Calls for which another thread is worth the time that waking it takes."""
+"""The fewest calls for which it pays to wake another thread."""
 
 
 def call_each(calls: Sequence[Callable[[], None]], threads: int) -> None:
@@ -29,5 +29,5 @@ def _call(calls: Sequence[Callable[[], None]]) -> None:
 
 @functools.cache
 def _pool(process: int) -> ThreadPoolExecutor:
-    """The threads of this process; those of a process do not live on in one that it forks."""
+    """The threads of this `process`. A forked process needs its own, because threads do not survive a fork."""
     return ThreadPoolExecutor(os.cpu_count())

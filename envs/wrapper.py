@@ -27,29 +27,29 @@ KEEP_FEASIBLE = ("project", "alpha")
 
 
 class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
-    """Lets an environment execute feasible actions only, so that any agent for Gymnasium can train under `constraint`.
+    """Lets an environment execute feasible actions only, so that any Gymnasium agent can train under `constraint`.
 
-    The agent's actions are suggestions (d,) in the box [-1, 1]^d. `mapping` makes a feasible action of one, and that is
-    rescaled from [-1, 1]^d to the action box of `env`. The feasible set is the one at the last observation of `env`,
-    on which the agent has based its action.
+    The agent's actions are suggestions (d,) in the box [-1, 1]^d. `mapping` turns a suggestion into a feasible action,
+    which is rescaled from [-1, 1]^d to the action box of `env`. The feasible set is the one at the last observation of
+    `env`, on which the agent has based its action.
 
     `mapping` is one of
     - "project": the closest feasible point. Suits every agent with a bounded action space.
     - "alpha": the suggestion itself where it is feasible, else the boundary point on its ray from the centre.
-    - "gauge": the box, scaled onto the set ray by ray. One to one, so no two suggestions are the same to the
-      environment. Suggestions outside the box are clipped to it first.
+    - "gauge": the box, scaled onto the set ray by ray. The map is one to one: different suggestions lead to different
+      actions. Suggestions outside the box are clipped to it first.
     - "radial": c + tanh(L)/L (suggestion - c), with L the set's gauge around the centre c. It is made for actors
-      without a tanh, whose suggestions are unbounded. Suggestions in the box reach only the share tanh(L) of the way
-      from the centre to the boundary: 76 % where the box is the set.
-    - None: suggestions have to be feasible. Others raise InfeasibleActionError.
+      without a tanh, whose suggestions are unbounded. A suggestion in the box gets only the share tanh(L) of the way
+      from the centre to the boundary: at most 76 % if the set is the box.
+    - None: suggestions must be feasible; others raise InfeasibleActionError.
 
     `info` of each step has `suggested_action` and `executed_action`, both normalised, float64 (d,), and `violation`,
-    a NumPy float64, that of the suggestion (`Constraint.violation`; feasible where <= 0).
+    the suggestion's `Constraint.violation` as a NumPy float64 (feasible if <= 0).
 
-    `constraint` is on normalised actions; `constraints.InUnits` makes one of a constraint in the units of `env`. It
-    sees the observations of `env` as float64 (n,). A wrapper that changes observations goes around this one, or else
-    the constraint sees what it returns. `features` maps an observation to the array (n,) that the constraint sees. It
-    is needed where observations are not flat arrays.
+    `constraint` is on normalised actions; `constraints.InUnits` converts a constraint in the units of `env`. It gets
+    the observations of `env` as float64 (n,). Put a wrapper that changes observations around this one; inside, it would
+    change what the constraint gets. `features` maps an observation to the array (n,) that the constraint gets. It is
+    needed if observations are not flat arrays.
 
     Raises ValueError for an unknown mapping, for an action space that is not a bounded box of floating-point numbers
     (d,), for a constraint of another dimension, and for observations that need `features`. `step` raises
@@ -147,7 +147,7 @@ def _excess(violation: float, allowed: float) -> str:
 
 
 def _checked_box(space: gymnasium.Space, dim: int) -> gymnasium.spaces.Box:
-    """The action space, a bounded box of floating-point numbers (dim,); ValueError where it is none."""
+    """The action space; ValueError unless it is a bounded box of floating-point numbers (dim,)."""
     if not isinstance(space, gymnasium.spaces.Box) or not np.issubdtype(space.dtype, np.floating):
         raise ValueError(f"the action space must be a box of floating-point numbers, got {space}")
     if not space.is_bounded():

@@ -2,10 +2,10 @@
 
     results/sweep/<task>/<variant>/
         seed=<seeds>.log     the output of the cell's processes on this machine, one after the other
-        seed=<seeds>.job     the Slurm job that has the cell, its cluster and its log
+        seed=<seeds>.job     the Slurm job that trains the cell, its cluster and its log
         seed=<seeds>.end     how the cell's last process failed: exit code, log and reason
 
-The runs themselves are where runs always are: see store/folder.py.
+The runs themselves are in their usual folders: see store/folder.py.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from sweep.exit import Exit
 from sweep.plugins import load_plugins, plugin_words
 
 RECORDS = "sweep"
-"""The folder of logs and records in that of results."""
+"""The subfolder of the results folder with logs and records."""
 
 
 @dataclass(frozen=True)
 class CellFolders:
-    """Where a cell's runs and records are. `root` is the folder of results; `seeds` ascend."""
+    """The folders of a cell's runs and records. `root` is the results folder; `seeds` are in ascending order."""
 
     root: Path
     task: str
@@ -49,7 +49,7 @@ class CellFolders:
         return [run_folder(self.root, self.task, self.variant, seed) for seed in self.seeds]
 
     def record(self, kind: str) -> Path:
-        """The file `kind`: log, job or end."""
+        """The path of the file `kind`: "log", "job" or "end"."""
         return self.root / RECORDS / self.task / self.variant / f"seed={format_seeds(self.seeds)}.{kind}"
 
     def read(self, kind: str) -> dict[str, Any]:
@@ -68,14 +68,14 @@ class CellFolders:
 
     @property
     def job(self) -> str:
-        """The Slurm job that has or had the cell, with its cluster, because job numbers repeat; empty without one."""
+        """The cell's last Slurm job and its cluster, as job numbers repeat across clusters; empty without one."""
         record = self.read("job")
         return f"{record['job']} of cluster {record['cluster']}" if record.get("cluster") else record.get("job", "")
 
     def note_end(self, code: int, log: Path, reason: str = "") -> None:
         """Record how a process of this cell failed, or delete the record if it ended well.
 
-        Without a `reason`, the log has it.
+        Without a `reason`, `reason_of` finds it in the log.
         """
         if code in (Exit.DONE, Exit.DIVERGED):
             self.record("end").unlink(missing_ok=True)
@@ -113,11 +113,11 @@ class Cell(CellFolders):
 
     @property
     def full_variant(self) -> str:
-        """The algorithm and all of its settings that differ from the paper's, however long that is."""
+        """The algorithm and all of its settings that differ from the paper's, of any length."""
         return variant_name(self.config.algo, differences(self.config, self.paper))
 
     def settings(self, seed: int) -> dict[str, object]:
-        """What config.yaml of a seed's run has."""
+        """The content of config.yaml of a seed's run."""
         named = {} if self.variant == self.full_variant else {"variant": self.full_variant}
         return saved_settings(self.config, seed) | named
 
@@ -127,7 +127,7 @@ class Cell(CellFolders):
         config = self.config
         words = {"algo": config.algo, "env": config.env, "seed": format_seeds(self.seeds)}
         words |= parse_variant(self.full_variant)[1]
-        if config.quick:  # it changes these two, so that the paper's values differ from its own
+        if config.quick:  # it changes these two, so even the paper's values must be given
             words |= {"eval_episodes": str(config.eval_episodes), "final_episodes": str(config.final_episodes)}
         words |= {"results": str(self.root.absolute()), "overwrite": config.overwrite}
         words |= {"device": config.device, "threads": str(config.threads)}
@@ -147,9 +147,9 @@ def paper_config(name: str, task: str) -> Config:
 def make_cells(settings: Mapping[str, str]) -> list[Cell]:
     """The cells that `settings` ask for: every algorithm of `algo` on every task of `env`.
 
-    A comma list of values gives a cell for each of them, several lists one for each combination; see `split_values` for
-    what is a list. A setting that only some of several algorithms have is applied to those. Raises ConfigError for
-    settings that do not fit.
+    A comma-separated list of values gives a cell for each value, several lists a cell for each combination;
+    `split_values` defines lists. A setting that only some of the algorithms have applies to those. Raises ConfigError
+    for settings that do not fit.
     """
     for key, choices in (("algo", [*ALGORITHMS, "paper", "all"]), ("env", [*TASKS, "all"])):
         if key not in settings:
@@ -187,7 +187,7 @@ def _cell_of(words: Sequence[str]) -> Cell:
 
 
 def shorten(cells: Sequence[CellFolders]) -> tuple[list[str], str]:
-    """The cells' variants without the settings that all of them share, and these settings."""
+    """The cells' variants without the settings that all cells share, and these shared settings as text."""
     variants = [parse_variant(cell.full_variant if isinstance(cell, Cell) else cell.variant) for cell in cells]
     shared = set.intersection(*(set(settings.items()) for _, settings in variants))
     names = [variant_name(algo, dict(settings.items() - shared)) for algo, settings in variants]

@@ -1,6 +1,6 @@
-"""The check before a training: everything that the run will ask of constraint, map and algorithm, asked once, in small.
+"""The check before training: it tries once, in small, all that the run will use of constraint, map and algorithm.
 
-What does not work is thus found in the first second, and not after the warm-up or at the first checkpoint.
+Errors thus appear in the first second, and not after the warm-up or at the first checkpoint.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ POINTS = ("project", "center", "alpha_map", "radial_map", "gauge_map", "linear_o
 
 
 def check_training(config: Config, make_env: Callable[[], Any]) -> None:
-    """Raise ConfigError, which names the method, if the run of `config` would not work.
+    """Raise a ConfigError that names the method if the run of `config` would not work.
 
-    It acts, evaluates and learns with tiny networks at first observations of the task's robot, and saves the state.
-    Errors of an algorithm's own code are not ConfigErrors: their tracebacks show the place.
+    The check acts, evaluates and learns with tiny networks at first observations of the task's robot, and saves the
+    state. Errors in an algorithm's own code keep their type, because their tracebacks show the place.
     """
     constraint = TASKS[config.env].constraint
     env = make_env()
@@ -52,7 +52,7 @@ def check_training(config: Config, make_env: Callable[[], Any]) -> None:
 
 
 def _check_projection(task: str, constraint: Constraint, action_dim: int, obs: Tensor) -> None:
-    """Whether a constraint is one, for this robot: obs (1, n)."""
+    """Raise ConfigError if the constraint does not fit the robot or its projection fails at obs (1, n)."""
     try:
         if constraint.dim != action_dim:
             raise ValueError(f"it is for {constraint.dim} action coordinates, the robot has {action_dim}")
@@ -84,7 +84,7 @@ def _reporting(task: str, constraint: Constraint, name: str, method: Callable) -
         try:
             result = method(*args, **kwargs)
             if isinstance(result, Ray):
-                _ = result.gradient  # a ray computes it later
+                _ = result.gradient  # a ray computes it only when asked
         except Exception as error:  # the constraint may be the user's own code
             raise refuse(obs, one_line(error)) from error
         if name in POINTS:
@@ -99,7 +99,7 @@ def _reporting(task: str, constraint: Constraint, name: str, method: Callable) -
 
 
 def _check_algorithm(config: Config, constraint: Constraint, obs: Tensor) -> None:
-    """Act, evaluate and learn at obs (seeds, batch, n)."""
+    """Act, evaluate and learn at obs (seeds, batch, n); ConfigError for a wrong result."""
     algorithm: Algorithm = ALGORITHMS[config.algo]
     small = replace(config, hidden=[4] * len(config.hidden), batch_size=BATCH)
     alone, agent = (
@@ -134,7 +134,7 @@ def _check_algorithm(config: Config, constraint: Constraint, obs: Tensor) -> Non
 
 
 def _check_map(config: Config, agent: Agent, obs: Tensor) -> None:
-    """Every method of the map that the algorithm may use, with its gradient."""
+    """Try every method of the map that the algorithm may use, with its gradient; ConfigError if one fails."""
     generator = torch.Generator().manual_seed(0)
     suggested = torch.randn(*obs.shape[:-1], agent.action_dim, generator=generator)
     suggested = agent.squash(suggested).requires_grad_()
@@ -164,7 +164,7 @@ def _check_map(config: Config, agent: Agent, obs: Tensor) -> None:
 
 
 def _check_actions(config: Config, what: str, agent: Agent, obs: Tensor, action: Tensor) -> None:
-    """Whether actions (..., d) are feasible at obs (..., n)."""
+    """Raise ConfigError if actions (..., d) have a wrong shape or are infeasible at obs (..., n)."""
     if action.shape != (*obs.shape[:-1], agent.action_dim):
         raise ConfigError(f"{config.algo} on {config.env}: {what} gives actions {_shape(action)} at {_shape(obs)}")
     if not _is_allowed(agent.constraint, obs, action.detach()):
@@ -173,7 +173,7 @@ def _check_actions(config: Config, what: str, agent: Agent, obs: Tensor, action:
 
 
 def _check_saving(what: str, state: Callable[[], Any]) -> None:
-    """Whether a checkpoint can keep a state: it holds tensors, numbers and text."""
+    """Raise ConfigError if a checkpoint cannot store a state: it takes tensors, numbers and text."""
     try:
         saved = io.BytesIO()
         torch.save(state(), saved)

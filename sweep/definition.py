@@ -1,4 +1,4 @@
-"""What a cell trains on, and the refusal to take a run of another definition for one of its own."""
+"""The definition of a cell's task and algorithm, and the search for runs that were trained on another definition."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sweep.cells import Cell
 
 
 def define(task: str, algo: str) -> dict[str, Description]:
-    """The descriptions of the task and of the algorithm, as definition.json has them."""
+    """The descriptions of the task and of the algorithm, as in definition.json."""
     return definition.define(TASKS[task].robot, TASKS[task].constraint, ALGORITHMS[algo])
 
 
@@ -32,10 +32,10 @@ def find_changed(cells: Sequence[Cell]) -> dict[Path, str]:
 
 
 def changed_runs(folders: Iterable[Path], now: Mapping[str, Description]) -> dict[Path, str]:
-    """The runs in `folders` that were trained on another definition than `now`, each with what a message says of it.
+    """The runs in `folders` that were trained on another definition than `now`, each with a text for messages.
 
-    Only runs that have ended or have a checkpoint count: others start again in any case. Runs of the project's own
-    tasks and algorithms may be older than definitions.
+    Only runs that have ended or have a checkpoint count: others start again anyway. A run without definition.json is
+    accepted for the project's own tasks and algorithms, because older runs have none.
     """
     found = {}
     for folder in folders:
@@ -50,7 +50,7 @@ def changed_runs(folders: Iterable[Path], now: Mapping[str, Description]) -> dic
 
 
 def refuse(changed: Mapping[Path, str]) -> NoReturn:
-    """Raise the ConfigError of a command that has such runs, `changed`, and does not say what becomes of them."""
+    """Raise ConfigError for runs of another definition, `changed`, as the command does not say what to do with them."""
     (folder, said), *others = changed.items()
     more = f" (so it is for {len(others)} more)" if others else ""
     raise ConfigError(f"{folder} {said}{more}; overwrite=changed starts such runs again and keeps the old ones")

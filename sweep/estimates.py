@@ -25,18 +25,18 @@ COLUMNS = ("task", "algo", "update_ms", "step_ms")
 SEEDS = 10
 """Seeds in lockstep when the rates were measured."""
 
-# Overheads that grow neither with the batch nor with the seeds, in units of those. That of the batch is fitted to
-# gradient steps of 100 and 256 transitions, those of the seeds to cells of one and of ten.
+# Fixed overheads: of a batch in transitions, of a gradient step and of a simulated step in seeds. The first is fitted
+# to gradient steps with 100 and 256 transitions, the others to cells of one seed and of ten.
 BATCH_OVERHEAD = 90
 UPDATE_OVERHEAD = 0.5
 STEP_OVERHEAD = 2.0
 
-# Memory: the peaks of short runs with one seed and with ten.
+# Memory, fitted to the peaks of short runs with one seed and with ten.
 PROCESS_BYTES = 380e6  # libraries
 SEED_BYTES = 15e6  # networks and optimisers of one seed
 
 TELLING_STEPS = 10_000
-"""The fewest gradient steps of a run whose time corrects the estimates."""
+"""Runs with fewer gradient steps do not correct the estimates."""
 
 
 class Rate(NamedTuple):
@@ -54,9 +54,9 @@ def _rates() -> dict[tuple[str, str], Rate]:
 
 
 def is_measured(task: str, algo: str) -> bool:
-    """Whether `_rate` is a measurement of this task, and of this algorithm or one of its family.
+    """Whether the task was measured, and the algorithm or another one of its family.
 
-    The time of a task of one's own depends most on its set, which can take a hundred times as long as another one.
+    The time of your own task depends most on its constraint, which can take a hundred times as long as another.
     """
     families = {ALGORITHMS[name].agent.family for _, name in _rates() if name in ALGORITHMS}
     return task in {name for name, _ in _rates()} and ALGORITHMS[algo].agent.family in families
@@ -74,7 +74,7 @@ def _rate(task: str, algo: str) -> Rate:
 
 
 def seconds(config: Config, paper: Config, seeds: int, start: int = 0) -> float:
-    """Time of training `seeds` seeds in lockstep from step `start` to the end, on one core.
+    """Estimated seconds of training `seeds` seeds in lockstep from step `start` to the end, on one core.
 
     `paper` is the paper's configuration of the same cell, whose rate was measured.
     """
@@ -87,12 +87,12 @@ def seconds(config: Config, paper: Config, seeds: int, start: int = 0) -> float:
     updates = per_step * (config.steps - max(start, config.learning_starts))
     evaluations = config.steps // config.eval_every - start // config.eval_every
     episodes = evaluations * config.eval_episodes + config.final_episodes
-    # The episodes of an evaluation run side by side, but the simulator takes the steps of each.
+    # The episodes of an evaluation run side by side, but the simulator computes the steps of each.
     return step * (config.steps - start + episodes * robot.max_episode_steps) + update * max(0.0, updates)
 
 
 def memory(config: Config, seeds: int) -> float:
-    """Bytes, with the replay buffer as full as it gets."""
+    """Estimated memory in bytes, with the replay buffer as full as it gets."""
     robot = _robot(config)
     centers = 2 if ALGORITHMS[config.algo].map.replays_center(TASKS[config.env].constraint) else 0
     width = 2 * robot.obs_dim + (1 + centers) * robot.action_dim + 2
@@ -105,16 +105,16 @@ def _robot(config: Config) -> Any:
 
 
 def corrections(runs: Iterable[Run], device: str) -> dict[tuple[str, str], float]:
-    """By (task, algorithm): the time that finished runs took over its estimate. ("", "") has the median of all.
+    """Actual time over estimated time of finished runs: the median by (task, algorithm), and at ("", "") that of all.
 
-    Leaves out runs on another kind of `device`, with other layers, too short to tell, or without their time.
+    Ignores runs on another kind of `device`, with other layers, with few gradient steps, or without a recorded time.
     """
     ratios: dict[tuple[str, str], list[float]] = {}
     for run in runs:
         if run.result is None or run.task not in TASKS or run.algo not in ALGORITHMS:
             continue
         try:
-            # (runs that are older than the choice of a device were on the CPU)
+            # Old runs without a device ran on the CPU.
             config = saved_config({"device": "cpu"} | run.config | {"env": run.task, "algo": run.algo})
             took, seeds = float(run.result["seconds"]["total"]), int(run.result["seeds_in_lockstep"])
             steps = int(run.result["gradient_steps"])
@@ -135,7 +135,7 @@ def correct(corrections: Mapping[tuple[str, str], float], task: str, algo: str) 
 
 
 def makespan(durations: Sequence[float], jobs: int) -> float:
-    """When the last of `durations` ends, if `jobs` at a time start in this order."""
+    """The time when the last of `durations` ends, if they run in this order, `jobs` at a time."""
     ends = [0.0] * max(1, min(jobs, len(durations)))
     for duration in durations:
         heapq.heapreplace(ends, ends[0] + duration)
@@ -143,7 +143,7 @@ def makespan(durations: Sequence[float], jobs: int) -> float:
 
 
 def in_words(duration: float) -> str:
-    """Seconds as a person says them: 45 s, 12 min, 3.5 h, 12 d."""
+    """A number of seconds as text: 45 s, 12 min, 3.5 h, 12 d."""
     for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if duration >= 1.5 * size:
             return f"{duration / size:.{1 if duration < 10 * size else 0}f} {unit}"

@@ -25,7 +25,7 @@ class Exit(IntEnum):
 
 
 def stoppable(command: Callable[[Callable[[], None]], Exit]) -> Exit:
-    """Run `command` with a function that raises Interrupted once a signal has asked for the end."""
+    """Run `command` with a function that raises Interrupted after a signal to stop."""
     with Interrupts() as interrupts:
         return command(interrupts.stop_if_asked)
 

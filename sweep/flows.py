@@ -1,7 +1,7 @@
-"""The flow of a cell's map: trained before the first seed of its task and settings, then shared by all.
+"""The normalising flow of a cell's map: trained once for a task and its settings, then shared by all seeds.
 
     results/flows/<task>/<flow>-<checksum>/
-        settings.json    what the checksum is of: the settings of the flow and the definition of the task
+        settings.json    the settings of the flow and the definition of the task; the checksum is that of this file
         training.csv     step, seconds, and the measures of `core.flow_training` at that step
         checkpoint.pt    while the training is unfinished
         flow.pt          the parameters, the measures and where they come from; written last, so its presence means that
@@ -9,7 +9,7 @@
     results/flows/<task>/<flow>-<checksum>.lock
                          while a process trains it; others wait for it
 
-Each run has the flow among its parameters too, so it needs this folder at its start only.
+Each run saves the flow with its parameters, so it needs this folder only at its start.
 """
 
 from __future__ import annotations
@@ -44,23 +44,23 @@ from store.provenance import describe_environment
 from store.tensors import load_tensors, save_tensors
 
 FOLDER = "flows"
-"""The folder of flows in that of results."""
+"""The subfolder of the results folder with flows."""
 VERSION = 2
-"""Counts the changes of how flows are trained."""
+"""The version of the training of flows, part of the checksum."""
 STATES = 20_000
-"""States of random play, of which `core.flow_training.HELD_OUT` are for measures."""
+"""Observations of random play; `core.flow_training.HELD_OUT` of them are kept for the measures."""
 ROBOTS = 40
-"""That play at the same time."""
+"""Robots that play at the same time."""
 LONGEST_HOLD = 16
-"""Steps for which random play repeats an action, at most: new actions in each step would cancel each other."""
+"""The most steps for which random play repeats an action: a new action in each step would cancel the last one."""
 MEASURES = 20
-"""How often a training is measured."""
+"""Number of measurements in a training."""
 SECONDS = 60.0
 """Time between checkpoints."""
 WAITING = 1.0
-"""Seconds between looks at a flow that another process trains."""
+"""Seconds between checks whether another process has trained the flow."""
 GOOD, WIDE = 0.99, 0.5
-"""Accuracy and recall below which a note says so."""
+"""A note is printed if accuracy or recall is below these."""
 
 
 class FlowFolder:
@@ -74,11 +74,11 @@ class FlowFolder:
         self.path = user_path(config.results) / FOLDER / config.env / f"{flow.flow}-{digest}"
 
     def read(self) -> dict[str, Any] | None:
-        """The trained flow, None where there is none. ConfigError for a file that is damaged."""
+        """The trained flow, or None if there is none. ConfigError if the file is damaged."""
         return self._load("flow.pt", "delete it, and the next run trains the flow again")
 
     def checkpoint(self) -> dict[str, Any] | None:
-        """What the training goes on from, None where it starts anew."""
+        """The checkpoint to resume from, or None to start anew; a damaged one is reported on stderr."""
         try:
             return self._load("checkpoint.pt", "the training of the flow starts again")
         except ConfigError as error:
@@ -95,7 +95,7 @@ class FlowFolder:
             raise ConfigError(f"{path} is damaged ({one_line(error)}); {remedy}") from error
 
     def begin(self) -> None:
-        """Make the folder."""
+        """Make the folder with settings.json."""
         self.path.mkdir(parents=True, exist_ok=True)
         self._replace("settings.json", self.settings)
 
@@ -117,11 +117,11 @@ class FlowFolder:
 def flow_of(
     config: Config, definition: Mapping[str, Description], stop_if_asked: Callable[[], None]
 ) -> dict[str, Any] | None:
-    """The flow that the map of `config` needs, from its folder or trained now; None where the map needs none.
+    """The flow of the map of `config`, read from its folder or trained now; None if the map has no flow.
 
-    It has the parameters as `state`, the last row of training.csv as `measures`, and as `info` what info.json of a run
-    has: versions, commit and machine of the process that trained it. `stop_if_asked` raises Interrupted
-    to end the training with a checkpoint. Raises ConfigError where the flow cannot be trained.
+    The flow is a dict: `state` has the parameters, `measures` the last row of training.csv, and `info` the versions,
+    commit and machine of the process that trained it, as in a run's info.json. `stop_if_asked` raises Interrupted to
+    end the training with a checkpoint. Raises ConfigError if the flow cannot be trained.
     """
     algorithm = ALGORITHMS[config.algo]
     if not isinstance(algorithm.map, Flow):
@@ -157,7 +157,7 @@ def _note(text: str) -> None:
 
 
 def _wait(folder: FlowFolder, stop_if_asked: Callable[[], None]) -> None:
-    """Wait while another process trains the flow."""
+    """Wait until another process has trained the flow or has stopped."""
     while folder.read() is None:
         stop_if_asked()
         try:
@@ -168,11 +168,11 @@ def _wait(folder: FlowFolder, stop_if_asked: Callable[[], None]) -> None:
 
 
 def _train(config: Config, flow: Flow, folder: FlowFolder, stop_if_asked: Callable[[], None]) -> None:
-    """Train the flow, from its checkpoint where there is one, and save it."""
+    """Train the flow, from its checkpoint if there is one, and save it."""
     folder.begin()
     before, rows, started = folder.checkpoint(), [], time.perf_counter()
     info = describe_environment(sys.orig_argv[1:])
-    interval = 0.5 if sys.stderr.isatty() else 60.0  # seconds, as of `core.progress`
+    interval = 0.5 if sys.stderr.isatty() else 60.0  # seconds, as in `core.progress`
     name = f"{config.algo} {config.env} flow"
     with tqdm(total=flow.flow_steps, desc=name, unit="step", mininterval=interval, maxinterval=interval) as bar:
         training = FlowTraining(flow, TASKS[config.env].constraint, random_play(config, stop_if_asked), stop_if_asked)
@@ -222,9 +222,9 @@ def _reported(what: str) -> Iterator[None]:
 
 @torch.no_grad()  # coefficients may be learned
 def random_play(config: Config, stop_if_asked: Callable[[], None]) -> Tensor:
-    """`STATES` observations (n, k) of the task's robot under random actions, which are projected and kept for a while.
+    """`STATES` observations (n, k) of the task's robot under random actions, each repeated for a while and projected.
 
-    They are in the order of time, those of all robots after each other.
+    They are in order of time: at each step, the observations of all robots.
     """
     task, random = TASKS[config.env], np.random.default_rng(0)
     robots = [envs.make(config.env, simulator=config.simulator) for _ in range(ROBOTS)]

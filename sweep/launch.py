@@ -1,4 +1,4 @@
-"""From the command line to the launcher of a sweep."""
+"""Checks the settings of a sweep, plans it, and starts its launcher."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None
     on_slurm = sweep.settings.launcher == "slurm"
     jobs = sweep.slurm.parallel if on_slurm else sweep.settings.jobs or 1
     threads = sweep.slurm.cpus if on_slurm else 1
-    if on_slurm and cells[0].config.device == AUTO:  # the machine that submits does not tell
+    if on_slurm and cells[0].config.device == AUTO:  # the jobs run on another machine than this one
         device = "cuda" if asks_for_gpus(sweep) else "cpu"
         cells = [Cell.of(replace(cell.config, device=device)) for cell in cells]
     cells = [Cell.of(on_this_machine(cell.config, threads)) for cell in cells]
     settings = cells[0].config  # one command has one device and one overwrite=
-    check_log(settings.log)  # jobs of Slurm have the same Python and home
+    check_log(settings.log)  # Slurm jobs have the same Python and home
     if not on_slurm:
         check_device(settings.device)
         for task, simulator in {(cell.task, cell.config.simulator) for cell in cells if cell.config.simulator}:
-            make_env(task, simulator).close()  # where it is not installed, no cell should start
+            make_env(task, simulator).close()  # if it is not installed, no cell should start
     elif settings.overwrite == "true":
         raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
     else:

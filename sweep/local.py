@@ -22,7 +22,7 @@ from sweep.states import Stage, reason_of
 
 RUN = Path(__file__).parents[1] / "run.py"
 POLL = 0.5
-"""Seconds between two looks at signals and progress."""
+"""Seconds between two checks of signals and progress."""
 
 
 class Queue:
@@ -68,7 +68,7 @@ class Queue:
             return End(1, 0.0, f"{error.filename or 'system'}: {one_line(error)}")
 
     def stop(self) -> None:
-        """Let every process write its checkpoint and end, and start no more. A second call ends them at once."""
+        """Make every process write its checkpoint and end, and start no more. A second call ends them at once."""
         with self.lock:
             self.stopping = True
             for process, _ in self.processes.values():
@@ -78,8 +78,8 @@ class Queue:
 def run_queue(entries: Sequence[Entry], jobs: int, stop_if_asked: Callable[[], None]) -> Exit:
     """Train the cells that have not ended, `jobs` at a time, in the given order.
 
-    Leaves out the cells that another process or a Slurm job trains, or may train. When `stop_if_asked` raises
-    Interrupted, the processes write their checkpoints and end.
+    Skips the cells that another process or a Slurm job trains, or may train. When `stop_if_asked` raises Interrupted,
+    the processes write their checkpoints and end; then Interrupted is raised again.
     """
     elsewhere = [entry for entry in entries if entry.state.stage.taken]
     entries = [entry for entry in entries if entry not in elsewhere]

@@ -18,7 +18,7 @@ from tables import Table, text_cells, to_terminal
 class Entry:
     """One cell of the plan; `factor` corrects the estimates of its time.
 
-    Where `timed` is False, nothing like it was ever measured. The estimate then only serves the order of the cells.
+    If `timed` is False, no similar cell was ever measured. The estimate then only serves to order the cells.
     """
 
     cell: Cell
@@ -41,14 +41,14 @@ class Entry:
         return estimates.memory(self.cell.config, len(self.cell.seeds))
 
     def progress(self) -> float:
-        """The share of the cell's time that is over, as far as the run folders tell."""
+        """The share of the cell's time that has passed, according to its run folders."""
         steps = self.cell.config.steps
         step = sum(reached(folder, steps) for folder in self.cell.folders) // len(self.cell.seeds)
         return 1.0 - self.seconds(step) / self.seconds(0) if step < steps else 1.0
 
 
 def make_plan(cells: Sequence[Cell], jobs: Mapping[str, str]) -> list[Entry]:
-    """The plan of `cells`; `jobs` as `state_of` takes them."""
+    """The plan of `cells`, longest first; `jobs` comes from `job_states`."""
     first = cells[0].config
     runs, _ = read_results(cells[0].root, {c.config.env for c in cells}, {c.config.algo for c in cells})
     factors = estimates.corrections(runs, first.device)  # one command has one device and one overwrite=
@@ -66,7 +66,7 @@ def make_plan(cells: Sequence[Cell], jobs: Mapping[str, str]) -> list[Entry]:
 
 
 def describe_plan(entries: Sequence[Entry], jobs: int) -> str:
-    """The plan as a table, its totals, and when it ends with `jobs` cells at a time."""
+    """The plan as text: a table, its totals, and the time that it takes with `jobs` cells at a time."""
     names, shared = shorten([entry.cell for entry in entries])
     rows = [
         text_cells(
@@ -120,7 +120,7 @@ def _time_left(entry: Entry) -> str:
 
 
 def memory_warning(entries: Sequence[Entry], jobs: int) -> str:
-    """A line if `jobs` cells at a time may need more memory than this machine has; else empty."""
+    """A warning if `jobs` cells at a time may need more memory than this machine has; otherwise empty."""
     there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     needed = _largest_memory(entries, jobs)
     if needed <= there:
@@ -129,5 +129,5 @@ def memory_warning(entries: Sequence[Entry], jobs: int) -> str:
 
 
 def _largest_memory(entries: Sequence[Entry], jobs: int) -> float:
-    """Bytes of the `jobs` largest cells that are left to do."""
+    """Memory in bytes of the `jobs` largest cells that are left to do, together."""
     return sum(sorted((entry.memory for entry in entries if entry.remaining), reverse=True)[:jobs])

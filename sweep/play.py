@@ -27,7 +27,7 @@ def play(words: Sequence[str], stop_if_asked: Callable[[], None] = lambda: None)
     """Run and film the policy in a run's folder, as `USAGE` says, and print the return of each episode.
 
     The starts of the episodes are the same every time. A video shows the feasible set of a two-dimensional action.
-    Raises ConfigError for wrong words, a video file that exists already, and what cannot be played or filmed.
+    Raises ConfigError for wrong words, an existing video file, and a policy that cannot be played or filmed.
     """
     if not words or words[0].partition("=")[0] in ("episodes", "which", "video"):
         raise ConfigError(f"expected the folder of a run first ({USAGE})")
@@ -101,7 +101,7 @@ def _picture(env: ActionConstrainedEnv) -> np.ndarray:
 def new_video(path: Path, fps: int) -> Iterator[Film]:
     """A new video file `path` (.mp4) with `fps` pictures a second, all of the size of the first one.
 
-    Raises ConfigError where the file exists already, for another suffix, and without imageio-ffmpeg. An error while the
+    Raises ConfigError if the file exists already, for another suffix, and without imageio-ffmpeg. An error while the
     video is open deletes the file.
     """
     try:

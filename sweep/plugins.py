@@ -1,4 +1,4 @@
-"""`plugin=my.py`: files of one's own that register tasks, maps and algorithms when they are imported."""
+"""`plugin=my.py`: your own files, which register tasks, maps and algorithms when they are imported."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def load_plugins(words: Sequence[str]) -> list[str]:
 
 
 def plugin_words() -> list[str]:
-    """The word with which another process loads the same plugins; none without plugins."""
+    """The word that makes another process load the same plugins; an empty list without plugins."""
     return [f"{KEY}={','.join(map(str, _loaded))}"] if _loaded else []
 
 
@@ -78,7 +78,7 @@ def _load(path: Path) -> None:
 
 
 def _is_imported(path: Path) -> bool:
-    """Whether the file is a module of this process already, as a program that is its own plugin is."""
+    """Whether the file is already a module of this process, such as a program that is its own plugin."""
     files = (getattr(sys.modules.get(name), "__file__", None) for name in ("__main__", path.stem))
     return any(file and Path(file).resolve() == path.resolve() for file in files)
 

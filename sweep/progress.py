@@ -16,7 +16,7 @@ from sweep.states import Stage
 
 BAR = "{desc} {percentage:3.0f}%|{bar}|"
 INTERVALS = (2.0, 60.0)
-"""Seconds between two looks into the run folders: for a terminal, and for a file."""
+"""Seconds between two checks of the run folders: for a terminal, and for a file."""
 
 
 class End(NamedTuple):
@@ -28,7 +28,7 @@ class End(NamedTuple):
 
 
 class Display:
-    """Shows the cells that are done, running and failed, and the expected end: a bar for all and one a process."""
+    """Shows which cells are done, running and failed, and the time left: a bar for all and one for each process."""
 
     def __init__(self, entries: Sequence[Entry], jobs: int):
         self.entries, self.jobs = entries, jobs
@@ -92,7 +92,7 @@ class Display:
         bar.refresh()
 
     def _eta(self, running: Mapping[Entry, float], shares: Mapping[Entry, float]) -> float:
-        """Seconds until the end, if the rest runs at the pace of the processes so far, relative to their estimates."""
+        """Seconds until the end, if the rest deviates from its estimates as the processes so far do."""
         left = {entry: entry.seconds(0) * (1.0 - share) for entry, share in shares.items()}
         done = sum(max(0.0, entry.remaining - left[entry]) for entry in running)
         took, estimated = self.seconds + sum(running.values()), self.estimated + done
@@ -105,7 +105,7 @@ class Display:
         return f"{len(self.done)} of {len(self.entries)} cell{'s' * (len(self.entries) != 1)} done"
 
     def summary(self) -> str:
-        """The last line."""
+        """The last line: the numbers of cells that are done, diverged, failed and not done."""
         open_cells = len(self.entries) - len(self.done) - len(self.failed)
         parts = [self._done()]
         parts += [f"{len(self.diverged)} of them with a seed that diverged"] if self.diverged else []

@@ -1,4 +1,4 @@
-"""The settings of a sweep: how cells are run, not what they learn. They are part of no run's name."""
+"""The settings of a sweep: how cells are run, not what they learn. They are not part of the names of runs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIGNAL_DELAY = 120
 
 @dataclass
 class SlurmSettings:
-    """What each job of a sweep asks Slurm for."""
+    """The resources that each job of a sweep requests from Slurm."""
 
     partition: str | None = field(default=None, metadata={"help": "partition (default: the cluster's)"})
     gpus: int = field(default=0, metadata={"help": "GPUs a cell"})
@@ -38,7 +38,7 @@ class SweepSettings:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The settings on the command line; `sbatch` has the further parameters of sbatch, by name."""
+    """The sweep settings of a command; `sbatch` has further parameters of sbatch by name."""
 
     settings: SweepSettings
     slurm: SlurmSettings
@@ -46,7 +46,7 @@ class Sweep:
 
     @property
     def wanted(self) -> bool:
-        """Whether there is more to do than to train the cells in this process, one after the other."""
+        """Whether the command asks for more than training the cells in this process, one after the other."""
         return self.settings.jobs is not None or self.settings.dry or self.settings.launcher == "slurm"
 
 

@@ -36,20 +36,20 @@ from sweep.train import train_cells
 
 ROOT = Path(__file__).parents[1]
 REQUEUES = 10_000
-"""How often the time limit may stop a cell. Each time, the cell has come further."""
+"""How often the time limit may stop a cell. A cell without progress is not requeued, so this number can be large."""
 SPARE_MEMORY = 1.3
 PATIENCE = 40.0
 """Seconds to wait for an answer of squeue: less than SIGNAL_DELAY, and more than the 30 s (Slurm's default) after which
 Slurm kills a cancelled job."""
 PAUSES = (2.0, 8.0)
-"""Shortest and longest seconds between two questions; random, because many jobs may get their signal at once."""
+"""Shortest and longest seconds between two calls of squeue; random, because many jobs may get their signal at once."""
 
 
 # ------------------------------------------------------------------------------------------------------- submission
 
 
 def asks_for_gpus(sweep: Sweep) -> bool:
-    # sbatch has other parameters that ask for GPUs, and some clusters require them.
+    # Other parameters of sbatch ask for GPUs too, and some clusters require these.
     return sweep.slurm.gpus > 0 or any(name.startswith(("gpus", "gres", "tres")) for name in sweep.sbatch)
 
 
@@ -80,7 +80,7 @@ def submit(sweep: Sweep, cells: Sequence[Cell]) -> None:
     folder = cells[0].root.absolute() / RECORDS / "slurm"
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        # The lock comes before the look at the queue: two commands must not both see the same cells as free.
+        # Take the lock before reading the queue: two commands must not both see the same cells as free.
         with run_lock(folder.with_name("submission")):
             jobs = job_states(cells)
             if NO_ANSWER in jobs.values():
@@ -108,7 +108,7 @@ def submit(sweep: Sweep, cells: Sequence[Cell]) -> None:
 
 def _submit(executor: Any, free: Sequence[Entry], clusters: str | None) -> list[Any]:
     """Submit the cells as one array and record the job of each. `clusters` is sbatch's parameter of that name."""
-    # Several clusters stay a list: squeue is not asked about them, whichever of them sbatch has chosen.
+    # A list of clusters is kept as it is. sbatch chooses one of them, and squeue is not asked about such jobs.
     name = clusters or os.environ.get("SBATCH_CLUSTERS") or slurm.cluster()
     cells = [replace(entry.cell, root=entry.cell.root.absolute()) for entry in free]
     for cell in cells:
@@ -149,7 +149,7 @@ def _parameters(sweep: Sweep, free: Sequence[Entry]) -> dict[str, Any]:
 
 
 def _explain(error: Exception) -> ConfigError:
-    """The message of sbatch, or for a misspelt parameter the name that may be meant."""
+    """A ConfigError with the message of sbatch or, for a misspelt parameter, the name that may be meant."""
     said = [line for line in str(error).splitlines() if line.startswith("sbatch: ")]
     if unknown := re.search(r"unrecognized option '--([\w-]+)", str(error)):
         usage = subprocess.run(["sbatch", "--help"], capture_output=True, text=True).stdout
@@ -171,7 +171,7 @@ class Job:
         self.cell = cell
 
     def checkpoint(self) -> Any:
-        """What submitit submits when it requeues the job: the same again."""
+        """What submitit submits when it requeues the job: the same job again."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self)
@@ -179,8 +179,9 @@ class Job:
     def __call__(self) -> None:
         from submitit import JobEnvironment
 
-        # submitit's handler would requeue at once, in the middle of a gradient step or of a checkpoint. `exit_code`
-        # notes the signal and ends the training with a checkpoint between two steps; later signals must not disturb it.
+        # submitit's handler would requeue at once, in the middle of a gradient step or of a checkpoint. Instead,
+        # `stoppable` notes the signal and ends the training between two steps, with a checkpoint; later signals must
+        # not disturb it.
         environment = JobEnvironment()
         signum = signal.Signals[f"SIG{JobEnvironment.USR_SIG}"]
         requeue: Any = signal.signal(signum, lambda *_: None)
@@ -208,12 +209,12 @@ class Job:
             sys.exit(code)
 
     def _progress(self) -> list[tuple[bool, int]]:
-        """How far each seed is, as a job that starts now would find it."""
+        """For each seed: whether it has ended, and the step from which a new job would resume."""
         return [(has_ended(folder), saved_step(folder)) for folder in self.cell.folders]
 
 
 def _is_running(job: str) -> bool:
-    """Whether Slurm still runs `job`: it signalled the time limit or a preemption, and did not cancel the job.
+    """Whether Slurm still runs `job`, so that its signal meant the time limit or a preemption and no cancellation.
 
     A cancelled job must not come back, although Slurm would allow it. If squeue gives no answer for PATIENCE seconds,
     the job was not cancelled, because Slurm would have killed it by then.

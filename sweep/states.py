@@ -1,4 +1,4 @@
-"""How cells stand: not started, queued, running or ended, from their folders, their records and Slurm's queue."""
+"""The states of cells (new, queued, running, ended, ...), from their folders, their records and Slurm's queue."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from store.lock import lock_owner
 from sweep.cells import CellFolders, format_seeds
 
 UNKNOWN_JOB = "UNKNOWN"
-"""In place of a job's state: the job belongs to another cluster than the one that Slurm's programs ask here."""
+"""In place of a job's state: the job belongs to a cluster other than that of this machine's Slurm."""
 NO_ANSWER = "NO_ANSWER"
 """In place of a job's state: squeue does not answer."""
 WAITING_JOB = ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "SPECIAL_EXIT")
@@ -24,7 +24,7 @@ WAITING_JOB = ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "SPECIAL_EX
 
 
 class Stage(Enum):
-    """How far a cell is. The values are the words that a person reads."""
+    """The stage of a cell. The values are the words that users read."""
 
     NEW = "new"
     QUEUED = "queued"
@@ -32,7 +32,7 @@ class Stage(Enum):
     INTERRUPTED = "interrupted"
     FAILED = "failed"
     FINISHED = "finished"
-    UNKNOWN = "unknown"  # Slurm does not tell here whether the cell's job is over
+    UNKNOWN = "unknown"  # it is not known here whether the cell's job is over
 
     @property
     def taken(self) -> bool:
@@ -42,9 +42,9 @@ class Stage(Enum):
 
 @dataclass(frozen=True)
 class CellState:
-    """The stage of a cell. `step` is where its unfinished seeds can resume: the least step of them.
+    """The stage of a cell. `step` is the smallest step from which an unfinished seed can resume.
 
-    `detail` tells a person more: who trains the cell, or why it failed.
+    `detail` tells users more, such as who trains the cell or why it failed.
     """
 
     stage: Stage
@@ -52,7 +52,7 @@ class CellState:
     detail: str = ""
 
     def describe(self) -> str:
-        """A few words: the stage, where it would resume, and who has the cell."""
+        """A few words: the stage, the step to resume from, and who trains the cell."""
         words = self.stage.value
         if self.step and self.stage is not Stage.FINISHED:
             words += f", {'at least' if self.stage is Stage.RUNNING else 'resumes from'} step {self.step}"
@@ -72,7 +72,7 @@ def job_states(cells: Iterable[CellFolders]) -> dict[str, str]:
 
 
 def state_of(cell: CellFolders, jobs: Mapping[str, str]) -> CellState:
-    """The state of a cell; `jobs` as from `job_states`."""
+    """The state of a cell; `jobs` comes from `job_states`."""
     folders = cell.folders
     unended = [folder for folder in folders if not has_ended(folder)]
     if not unended:
@@ -97,7 +97,7 @@ def state_of(cell: CellFolders, jobs: Mapping[str, str]) -> CellState:
 
 
 def reached(folder: Path, steps: int) -> int:
-    """How many of its `steps` a run has done, as far as its folder tells."""
+    """How many of its `steps` a run has done, according to its folder."""
     return steps if has_ended(folder) else max(last_evaluated(folder), saved_step(folder))
 
 
@@ -115,7 +115,7 @@ def reason_of(code: int, log: Path) -> str:
 
 
 def list_details(cells: Sequence[CellFolders], states: Sequence[CellState]) -> list[str]:
-    """A line for each cell with a reason to tell: why it failed, diverged or was interrupted."""
+    """A line for each cell that has a detail, such as why it failed, diverged or was interrupted."""
     return [
         f"{cell.name} seed={format_seeds(cell.seeds)}: {state.detail}"
         for cell, state in zip(cells, states, strict=True)
@@ -124,7 +124,7 @@ def list_details(cells: Sequence[CellFolders], states: Sequence[CellState]) -> l
 
 
 def count_states(states: Sequence[CellState]) -> str:
-    """How many cells are at which stage."""
+    """The numbers of cells at each stage, as text."""
     counts = Counter(state.stage.value for state in states)
     return f"{len(states)} cell{'s' * (len(states) > 1)}: " + ", ".join(f"{n} {stage}" for stage, n in counts.items())
 
@@ -135,7 +135,7 @@ def _started_since(record: Path, folders: Sequence[Path]) -> bool:
         # All hosts share the file system's clock. Each start and each resumption writes info.json.
         written = record.stat().st_mtime_ns
         return any(info.stat().st_mtime_ns > written for f in folders if (info := f / "info.json").exists())
-    except OSError:  # deleted in this moment
+    except OSError:  # deleted at this moment
         return False
 
 

@@ -1,4 +1,4 @@
-"""`run.py status`: how the cells in a folder of results stand."""
+"""`run.py status`: the states of the cells in a folder of results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tables import Table, text_cells, to_terminal
 
 
 def find_cells(root: Path) -> list[CellFolders]:
-    """The cells below `root`: those of sweeps by their records, other runs as one cell for each folder of seeds."""
+    """The cells below `root`: those of sweeps from their records; other runs of one task and variant form one cell."""
     cells: dict[CellFolders, None] = {}
     for record in sorted((root / RECORDS).glob("*/*/seed=*.*")):
         if record.suffix in (".log", ".job"):
@@ -35,7 +35,7 @@ def find_cells(root: Path) -> list[CellFolders]:
 
 
 def describe_status(words: Sequence[str]) -> str:
-    """The table of `run.py status FOLDER`, also of `results=FOLDER`. Raises ConfigError unless it is one with cells."""
+    """The text of `run.py status FOLDER` or `results=FOLDER`. Raises ConfigError if the folder has no cells."""
     if len(words) != 1:
         raise ConfigError(f"expected one folder of results, as in `run.py status results/`, got {len(words)}")
     root = user_path(words[0].removeprefix("results="))
@@ -65,7 +65,7 @@ def _table(cells: Sequence[CellFolders], states: Sequence[CellState]) -> str:
 
 
 def _progress(cell: CellFolders, state: CellState) -> str:
-    """The steps of the unfinished seed furthest behind, of how many, and how many seeds have ended."""
+    """As text: steps of the unfinished seed furthest behind, steps of the run, and the number of ended seeds."""
     left = [folder for folder in cell.folders if not has_ended(folder)]
     if not left:
         return "all"

@@ -54,17 +54,17 @@ def train_words(words: str) -> bool:
 
 def train_cells(cells: Sequence[Cell], stop_if_asked: Callable[[], None] = lambda: None) -> Exit:
     """Train `cells` one after the other. `stop_if_asked` raises Interrupted to end the training with a checkpoint."""
-    # All of them before the first training, which may change the objects that they describe.
+    # Define all cells before the first training, which may change the objects described.
     definitions = [define(cell.config.env, cell.config.algo) for cell in cells]
     done = [train(*each, stop_if_asked) for each in zip(cells, definitions, strict=True)]
     return Exit.DONE if all(done) else Exit.DIVERGED
 
 
 def train(cell: Cell, definition: Mapping[str, Description], stop_if_asked: Callable[[], None] = lambda: None) -> bool:
-    """Train the seeds of one cell that have not ended, from their checkpoints where there are any.
+    """Train the seeds of one cell that have not ended, from their checkpoints if there are any.
 
-    `definition` is what `sweep.definition.define` says of the cell's task and algorithm.
-    Prints each result and its folder. Returns whether every seed has a result.
+    `definition` comes from `sweep.definition.define`. Prints each result and its folder. Returns whether every seed has
+    a result.
     """
     cell = replace(cell, config=on_this_machine(cell.config))
     config, folders = cell.config, dict(zip(cell.seeds, cell.folders, strict=True))
@@ -133,8 +133,8 @@ def make_trainer(
 ) -> Trainer:
     """The trainer of one cell, with its environments and its agent; one writer for each seed.
 
-    `flow` has the parameters of the map's flow, where it has one and the training does not resume.
-    Raises ConfigError if the networks and the replay buffer do not fit into memory.
+    `flow` has the parameters of the map's flow, if the map has one and the training does not resume. Raises ConfigError
+    if the networks and the replay buffer do not fit into memory.
     """
     new_env = partial(make_env, config.env, config.simulator)
     train_envs = [new_env() for _ in seeds]
@@ -153,9 +153,10 @@ def make_trainer(
 
 
 def on_this_machine(config: Config, threads: int | None = None) -> Config:
-    """`config` with the device and the threads for which "auto" stands here; `threads` for a cell that is not alone.
+    """`config` with "auto" replaced by this machine's device and number of threads.
 
-    Both change the rounding of what is learned, and the chaos of training makes another run of it.
+    `threads` is the number for a cell that shares the machine with others. Device and threads change the rounding, and
+    the chaos of training turns that into a different run.
     """
     device = config.device
     if device == AUTO:
@@ -184,7 +185,7 @@ def check_log(text: str) -> None:
 
 
 def make_env(task: str, simulator: str | None) -> envs.ActionConstrainedEnv:
-    """The environment of `task`. Raises ConfigError if the simulator is not there."""
+    """The environment of `task`. Raises ConfigError if the simulator is not available."""
     try:
         return envs.make(task, simulator=simulator)
     except envs.UnavailableError as error:
@@ -194,7 +195,7 @@ def make_env(task: str, simulator: str | None) -> envs.ActionConstrainedEnv:
 def check_robot(task: str) -> None:
     """Raise ConfigError if the robot of `task` does not keep the protocol of `envs.Robot` in a few steps.
 
-    Also raised where no algorithm has hyperparameters for the group that the robot names.
+    Also raised if no algorithm has hyperparameters for the group that the robot names.
     """
     robot = envs.TASKS[task].robot
     groups = {group: None for algorithm in ALGORITHMS.values() for group in algorithm.agent.paper}
@@ -217,7 +218,7 @@ def _find_checkpoints(folders: dict[int, Path], ended: set[int]) -> tuple[list[d
         try:
             checkpoints, problems = CheckpointFolder(folder).read()
         except FormatError:
-            if seed in ended:  # its neighbours in the batch may still need the checkpoint, in that version
+            if seed in ended:  # other seeds of its batch may still need the checkpoint, with the version that wrote it
                 continue
             raise
         if not checkpoints and seed in ended:  # left by a crash during their deletion
@@ -242,7 +243,7 @@ def _resume(
 ) -> None:
     """Resume the training from the checkpoints of `group`, which were written together."""
     config, before = cell.config, next(iter(group.values())).group
-    # Seeds that have ended stay in the batch, which keeps its shape. If other seeds are missing, it changes anyway.
+    # Seeds that have ended stay in the batch to keep its shape. If other seeds are missing, the shape changes anyway.
     seeds = list(before) if set(before) == set(group) else [seed for seed in group if seed not in ended]
     for seed in seeds:
         _check_settings(folders[seed], group[seed].settings, cell.settings(seed))
@@ -264,9 +265,9 @@ def _resume(
 
 
 def _check_settings(folder: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
-    """Raise ConfigError if a setting that decides what is learned differs from the one that the run started with.
+    """Raise ConfigError if a setting that decides what is learned differs from its value at the start of the run.
 
-    The simulator counts too, because the state of one does not fit another.
+    The simulator counts too, because the state of one simulator does not fit another.
     """
     for key in now.keys() - (set(RUN_KEYS) - {"simulator"}):
         if before.get(key) != now[key]:

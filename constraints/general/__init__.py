@@ -1,7 +1,7 @@
-"""Sets of one's own: rows and ellipses that depend on the observation, and their intersections.
+"""General sets, for constraints of your own: rows and ellipses that depend on the observation, and their intersections.
 
-They have no closed forms. General solvers find projection, linear oracle and centre, on the CPU in float64, wherever
-the tensors are. In training, a GPU has to wait for them.
+They have no closed forms. Wherever the tensors are, solvers compute projection, linear oracle and centre on the CPU in
+float64. In training, a GPU has to wait for them.
 """
 
 from constraints.general.intersection import Intersection

@@ -1,7 +1,7 @@
 """Exact projection on polyhedra, in batch, by the dual active-set method of Goldfarb and Idnani (1983).
 
-It starts at the point itself, adds the most violated row and drops rows whose multiplier would turn negative. So it
-needs no interior, ends after finitely many steps, is exact to rounding, and proves a set empty.
+It starts at the point itself, adds the most violated row and drops rows whose multiplier would turn negative. It
+therefore needs no interior, ends after finitely many steps, is exact to rounding, and proves when a set is empty.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from constraints.errors import ConstraintError, EmptySetError, SampleName
 from constraints.general.scaled_sets import EMPTY
 from constraints.numerics import times
 
-# A row depends on the active ones where its part outside their span is shorter than this.
+# A row depends on the active ones if its part outside their span is shorter than this.
 _DEPENDENT = 1e-9
-# A multiplier that falls more slowly than this along a step does not fall.
+# A multiplier that decreases more slowly than this along a step counts as constant.
 _FALLS = 1e-12
-# Finished samples leave the batch when they are this share of it: to copy the others costs as much as some steps.
+# Finished samples are removed from the batch once they exceed this share of it: copying the others costs several steps.
 _LEAVING = 0.3
 
 
@@ -26,8 +26,8 @@ def project_on_rows(
 ) -> tuple[Tensor, Tensor]:
     """Closest point (n, d) to target (n, d) with rows (n, m, d) @ a <= bounds (n, m), and its multipliers (n, m).
 
-    Rows have unit norm or are 0. The rows with a positive multiplier are linearly independent. An EmptySetError names
-    a sample whose set is empty, and the row that shows it if that is one of the first `named` ones.
+    Rows have unit norm or are 0. The rows with a positive multiplier are linearly independent. An EmptySetError names a
+    sample whose set is empty and, among the first `named` rows, one that takes part in the conflict.
     """
     count, m, dim = rows.shape
     multipliers, solution = torch.zeros_like(bounds), target.clone()
@@ -35,8 +35,8 @@ def project_on_rows(
     sample = torch.arange(count, device=rows.device)
     point, limits = target.clone(), bounds.clone()
     normals = rows.new_zeros(count, dim, dim)  # (sample, slot, coordinate)
-    # normals = triangle' @ basis, with orthonormal rows in the basis and the inverse of the upper triangle. Unused
-    # slots are 0.
+    # normals = triangle' @ basis, where the rows of the basis are orthonormal. Only the inverse of the upper triangle
+    # is stored. Unused slots are 0.
     basis, inverse = torch.zeros_like(normals), torch.zeros_like(normals)
     index = torch.full((count, dim), -1, device=rows.device)
     weight = rows.new_zeros(count, dim)
@@ -69,7 +69,7 @@ def project_on_rows(
         normal = rows.take_along_dim(entering[:, None, None], 1).squeeze(1)
         used = index >= 0
         slot = used.sum(-1)
-        # The part outside the span, twice: once leaves the rounding of a short part.
+        # Remove the part in the span twice: after one pass, a short remainder would be mostly rounding.
         along = times(basis, normal)
         step = normal - times(basis.mT, along)
         again = times(basis, step)
@@ -86,11 +86,11 @@ def project_on_rows(
             conflicting = (stuck & (over > EMPTY)).nonzero().squeeze(-1)
             if len(conflicting) > 0:
                 first = int(conflicting[0])
-                # The row that cannot be met, or one that is in its way; not a row of the box.
+                # Name the row that cannot be satisfied or one in conflict with it, but no row of the box.
                 conflict = [row for row in [int(entering[first]), *index[first].tolist()] if 0 <= row < named]
                 which, spot = f", row {conflict[0]}" if conflict else "", int(sample[first])
                 raise EmptySetError(f"{name(spot)}{which}: the set is empty", name.position(spot))
-            # The active rows meet a dependent row up to rounding: raise its limit.
+            # The active rows satisfy a dependent row up to rounding: raise its limit.
             limits[stuck.nonzero().squeeze(-1), entering[stuck]] += over[stuck].clamp(min=0.0) + tolerance[stuck]
 
         idle = stuck | done
@@ -120,7 +120,7 @@ def project_on_rows(
             kept = normals[where].take_along_dim(order.unsqueeze(-1), 1) * (index[where] >= 0).unsqueeze(-1)
             normals[where] = kept
             basis[where], inverse[where] = _factors(kept, index[where] >= 0)
-        # Steps from far away leave the active rows by their rounding. Return to them.
+        # Long steps leave the active rows by their rounding. Return to them.
         offset = limits.gather(-1, index.clamp(min=0)) - times(normals, point)
         offset = torch.where((index >= 0) & ~(pending | done).unsqueeze(-1), offset, 0.0)
         point = point + times(basis.mT, times(inverse.mT, offset))

@@ -1,4 +1,4 @@
-"""The base of sets of one's own, and checks of the coefficients that their functions return."""
+"""The base class of general sets, which checks the coefficients that their functions return."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 
 
 class At:
-    """A set at observations (..., n): the tensors of its coefficients, and the set written out when that is needed."""
+    """A set at observations (..., n): the tensors of its coefficients, and its rows and ellipses on demand."""
 
     def __init__(
         self, obs: Tensor, tensors: list[Tensor], write: Callable[[], ExplicitSet], parts: tuple[Any, ...] = ()
@@ -51,11 +51,11 @@ class At:
 
 
 class GeneralConstraint(Constraint):
-    """A set that `explicit(obs)` writes out. A subclass adds that, `_coefficients`, `_violation` and `_part_gauges`.
+    """A set of rows and ellipses. A subclass implements `explicit`, `_coefficients`, `_violation` and `_part_gauges`.
 
-    `on_empty` says what happens where no action meets the constraint: "error" raises an EmptySetError with the sample;
-    with "least", the set is that of the actions in the box with the least violation, up to 5e-7, and `violation`
-    reports it. ValueError for another value.
+    `on_empty` decides what happens if no action satisfies the constraint. "error" raises an EmptySetError that names
+    the sample. With "least", the set consists of the actions in the box with the least violation, up to 5e-7, and
+    `violation` still reports that violation. ValueError for any other value.
     """
 
     origin_centered = False
@@ -73,7 +73,7 @@ class GeneralConstraint(Constraint):
         check_observation(obs)
         at = self.at(obs.double())
         sets = scale_sets(at.written, at.lead, check=False)
-        # A row 0 <= b is violated by -b wherever one is.
+        # Every action violates a row 0 <= b by -b.
         fixed = torch.where(sets.solid, 0.0, -sets.bounds).amax(-1)
         return torch.maximum(least_excess(sets), fixed).clamp(min=0.0).view(at.lead).to(obs)
 
@@ -91,14 +91,14 @@ class GeneralConstraint(Constraint):
 
     @abstractmethod
     def _part_gauges(self, at: At, direction: Tensor, center: Tensor | None) -> list[Tensor]:
-        """`_gauge_gradients`; a ConstraintError where the centre is not interior."""
+        """As `_gauge_gradients`, but with a ConstraintError if the centre is not interior."""
 
     def _at(self, obs: Tensor) -> At | Tensor:
         # Transforms of torch.func see the solvers from outside, as one function of the observation.
         return obs if is_transformed() else self._coefficients(obs)
 
     def at(self, at: At | Tensor) -> At:
-        """The coefficients, whatever `_at` returned."""
+        """The coefficients for what `_at` returned, which may be the observation."""
         if not isinstance(at, Tensor):
             return at
         if is_mapped():
@@ -109,7 +109,7 @@ class GeneralConstraint(Constraint):
         return self._coefficients(at)
 
     def _check_center(self, at: At | Tensor, center: Tensor) -> None:
-        pass  # in every call where it is used, below and in the subclasses
+        pass  # checked in every call that uses it, below and in the subclasses
 
     def _gauge_and_gradient(self, at: At | Tensor, direction: Tensor, center: Tensor | None) -> tuple[Tensor, Tensor]:
         if center is not None:
@@ -125,7 +125,7 @@ class GeneralConstraint(Constraint):
         except ConstraintError:
             if self.on_empty != "least":
                 raise
-        # No centre is inside a set that is empty; it may be inside what stands for the set.
+        # No centre is inside an empty set. It may be inside the widened set that replaces it.
         self._refuse_derivatives(at, "where the set is empty")
         lead = tuple(direction.shape[:-1])
         sets = widened(scale_sets(at.written, lead, check=False), flat=True)
@@ -152,7 +152,7 @@ class GeneralConstraint(Constraint):
             jacobian = projection_jacobian(sets, solution, metric, multipliers)
             return times(jacobian, vector.reshape(-1, self.dim).cpu()).view(vector.shape).to(vector)
 
-        # There is no closest point to an infinite one.
+        # An infinite point has no closest one.
         answer = torch.where(finite, solution, torch.nan)
         return answer.view(action.shape).to(action.device), product
 
@@ -181,7 +181,7 @@ class GeneralConstraint(Constraint):
                 return optimal_points(sets, slope, linear=True)[0]
             corner = sets.given_rows + torch.arange(self.dim, device=slope.device) + self.dim * (slope < 0.0)
             point, _ = maximize_on_rows(sets.rows, sets.bounds, slope, corner, sets.name, sets.given_rows)
-            # It may leave the set by the linear program's rounding.
+            # The point may be outside the set by the linear program's rounding.
             return project_on_rows(sets.rows, sets.bounds, point, sets.name, sets.given_rows)[0]
 
         solution = self._solve(at, gradient.shape[:-1], solve)[1]
@@ -205,9 +205,10 @@ class GeneralConstraint(Constraint):
     def _solve(
         self, at: At, lead: tuple[int, ...], solve: Callable[[ScaledSets], Result], interior: bool = False
     ) -> tuple[ScaledSets, Result]:
-        """The sets of a batch of shape `lead`, and what `solve` makes of them or of what stands for empty ones.
+        """The sets of a batch of shape `lead`, and the result of `solve` on them.
 
-        `interior`: whether it needs an interior on rows; with ellipses it always may.
+        With `on_empty="least"`, widened sets replace empty ones. `interior` says whether `solve` needs an interior even
+        without ellipses; with ellipses, sets without interior are always widened too.
         """
         try:
             sets = scale_sets(at.written, lead)
@@ -221,7 +222,7 @@ class GeneralConstraint(Constraint):
         return sets, solve(sets)
 
     def _finite(self, vector: Tensor) -> tuple[Tensor, Tensor]:
-        """Vectors (..., d) as a batch (n, d) on the CPU, 0 where they are NaN or infinite, and where (n, 1) not."""
+        """Vectors (..., d) as a batch (n, d) on the CPU, 0 if not finite, and a mask (n, 1) of finite ones."""
         flat = vector.reshape(-1, self.dim).cpu()
         finite = flat.isfinite().all(-1, keepdim=True)
         return torch.where(finite, flat, 0.0), finite
@@ -235,7 +236,7 @@ class GeneralConstraint(Constraint):
 
 
 def check_obs(obs: Tensor) -> None:
-    """Raise a ConstraintError for a NaN or infinite observation, a TypeError for no tensor."""
+    """Raise a ConstraintError for a NaN or infinite observation, a TypeError if it is not a tensor."""
     check_tensor("obs", obs)
     valid = obs.isfinite().all(-1)
     require(valid.flatten(), "the observation is NaN or infinite", name_samples(tuple(valid.shape)))

@@ -13,22 +13,22 @@ from constraints.general.projection import closest_points
 from constraints.general.scaled_sets import NO_INTERIOR, ScaledSets, guessed_points
 from constraints.numerics import times
 
-# The share of the largest radius that a centre keeps. A larger one leaves less room in which it moves continuously.
+# A centre is at least this share as deep as the deepest point. Larger shares leave less room for continuity.
 _DEEP = 0.9
-# A guess less deep than this, or than half of the largest depth, gives way to a point that is nearly the deepest.
+# A guess less deep than this and than half of the largest depth gives way to a point that is nearly the deepest.
 _SHALLOW = 1e-2
-# In a set that is nowhere deeper, too little room is left beside the deepest point.
+# In a set that is nowhere deeper than this, the deepest point is taken: too little room is left beside it.
 _THIN = 1e-6
 
 
 def deep_points(traced: ScaledSets) -> Tensor:
-    """Centres (n, d) of sets without ellipses: the point nearest to the origin of those that are `_DEEP` times as deep
-    as the deepest. An EmptySetError where a set is empty or flat. Differentiable where the sets are.
+    """Centres (n, d) of sets without ellipses, differentiable if the sets are. EmptySetError if a set is empty or flat.
 
-    It is continuous in rows and bounds. The largest depth is: it is the maximum over the box of a continuous function.
-    The points of that share of it are a convex set with interior, so they move continuously, and so does the one of
-    them that is nearest to the origin. The deepest points themselves may jump: those of a wedge are at its wide end,
-    however small its angle.
+    The centre is the point nearest to the origin among those at least `_DEEP` times as deep as the deepest. It is
+    continuous in rows and bounds. The largest depth is continuous, because it is the maximum over the box of a
+    continuous function. The points of at least that share of it form a convex set with interior, so this set moves
+    continuously, and so does its point nearest to the origin. The deepest points themselves may jump: in a wedge they
+    lie at its wide end, however small its angle.
     """
     sets = traced.detach()
     deepest, weight = deepest_on_rows(sets)
@@ -50,8 +50,11 @@ def deep_points(traced: ScaledSets) -> Tensor:
 
 
 def interior_points(sets: ScaledSets) -> Tensor:
-    """Interior points (n, d) of sets with ellipses, continuous in these: the guess where it is deep, the point nearest
-    to it of those `_DEEP` times as deep as the deepest where it is outside, and a mean of the two in between."""
+    """Interior points (n, d) of sets with ellipses, continuous in the sets.
+
+    The point is the guess if that is deep inside. If the guess is far outside, the point is the nearest one among those
+    at least `_DEEP` times as deep as the deepest. In between it is a weighted mean of the two.
+    """
     guess = guessed_points(sets)
     depth = sets.depth(guess)
     shallow = (depth < _SHALLOW).nonzero().squeeze(-1)
@@ -64,7 +67,7 @@ def interior_points(sets: ScaledSets) -> Tensor:
     if len(wide) > 0:
         nearest = closest_points(part[wide].inner(_DEEP * largest[wide]), start[wide])[0]
         inside = inside.index_put((wide,), nearest)
-    # The depth is concave, so that of a mean is at least the mean of the two, which is positive.
+    # The depth is concave: a mean of two points is at least as deep as the mean of their depths, which is positive.
     deep = (0.5 * largest).clamp(max=_SHALLOW)
     share = (0.5 - 0.5 * depth / deep).clamp(0.0, 1.0).unsqueeze(-1)
     return guess.index_put((shallow,), torch.lerp(start, inside, share))

@@ -1,4 +1,4 @@
-"""The deepest points of sets, how far sets without an interior miss one, and sets that are widened by that."""
+"""The deepest points of sets, the least excess over their constraints, and the widening of sets without interior."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from constraints.numerics import times
 
 # The depth of the interior that `widened` gives to sets without one; single precision can tell it from 0.
 _ROOM = 5e-7
-# The rounding of the least violation, where that is large.
+# Relative rounding of the least violation.
 _SHARE = 1e-12
-# The interior-point method's accuracy: deep enough below NO_INTERIOR to tell a thin set from a flat one.
+# The interior-point method's accuracy: far enough below NO_INTERIOR to tell a thin set from a flat one.
 _ACCURACY = 1e-12
 
 
 def deepest_on_rows(sets: ScaledSets, box: bool = True) -> tuple[Tensor, Tensor]:
-    """The deepest point of each set and its depth, as the last coordinate (n, d + 1), and multipliers (n, m).
+    """The deepest point of each set with its depth as the last coordinate (n, d + 1), and multipliers (n, m).
 
-    Ellipses are left out. The depth is the distance to the nearest row that is not 0, negative where there is no point
-    in all of them; without `box`, the box's rows do not bound the depth, but the point. The multipliers say how the
-    depth changes with the bounds.
+    Ellipses are ignored. The depth is the distance to the nearest nonzero row, negative if no point satisfies all rows.
+    Without `box`, the rows of the box bound the point but not its depth. The multipliers are the derivatives of the
+    depth with respect to the bounds.
     """
     m, d = sets.given_rows, sets.dim
     solid = sets.solid
     if not box:
         solid = solid & sets.given
-    # Rows of unit norm again.
+    # Scale the rows to unit norm again.
     shrink = torch.where(solid, 0.5, 1.0).to(sets.rows).sqrt()
     rows = torch.cat((sets.rows, solid.to(sets.rows).unsqueeze(-1)), -1) * shrink.unsqueeze(-1)
     slope = torch.zeros_like(rows[:, 0])
     slope[:, -1] = 1.0
-    # To begin with, the depth is held by one row, the tightest, and the faces of the box opposite to it.
+    # At the start, the tightest row and the faces of the box opposite to it hold the depth.
     reach = sets.rows.abs().sum(-1)
     limit = torch.where(solid, (sets.bounds + reach) / (1.0 + reach), torch.inf)
     first = limit[:, : m + 1].argmin(-1, keepdim=True)
@@ -48,7 +48,7 @@ def deepest_on_rows(sets: ScaledSets, box: bool = True) -> tuple[Tensor, Tensor]
 
 
 def deepest_points(sets: ScaledSets) -> Tensor:
-    """Points (n, d) of the largest `depth`, of sets with ellipses; an EmptySetError where that is not positive."""
+    """Points (n, d) of largest `depth` in sets with ellipses. EmptySetError if a set is empty or has no interior."""
     solution, converged = _deepest_in_cones(sets, box=True)
     point = solution[:, :-1]
     deep = sets.depth(point) > NO_INTERIOR
@@ -61,9 +61,9 @@ def deepest_points(sets: ScaledSets) -> Tensor:
 def _deepest_in_cones(sets: ScaledSets, box: bool) -> tuple[Tensor, Tensor]:
     """The deepest point of sets with ellipses and its depth (n, d + 1), and whether (n,) the method converged.
 
-    Without `box`, the box's rows do not bound the depth, but the point.
+    Without `box`, the rows of the box bound the point but not its depth.
     """
-    # Around the centre of the smallest ellipse, in its size.
+    # Solve around the centre of the smallest ellipse, in units of its size.
     traces = sets.matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
     size = sets.inverse_size()
     smallest = traces.argmax(-1)[:, None, None]
@@ -86,9 +86,9 @@ def _deepest_in_cones(sets: ScaledSets, box: bool) -> tuple[Tensor, Tensor]:
 
 
 def least_excess(sets: ScaledSets) -> Tensor:
-    """The least (n,) by which points of the box leave rows and ellipses, negative where they are inside.
+    """The least excess (n,) over rows and ellipses of the points in the box, negative if some point is inside.
 
-    A row 0 <= b does not count. Where there is nothing else, it is -1.
+    Rows 0 <= b do not count. If nothing else is left, the result is -1.
     """
     sets = replace(sets, bounds=torch.where(sets.solid, sets.bounds, 1.0))
     bounded = (sets.solid & sets.given).any(-1) | (sets.matrix.shape[1] > 0)
@@ -102,11 +102,11 @@ def least_excess(sets: ScaledSets) -> Tensor:
 
 
 def widened(sets: ScaledSets, flat: bool) -> ScaledSets:
-    """The sets with rows and ellipses, not the box, moved outwards by the same distance where they are empty.
+    """The sets, with rows and ellipses (not the box) moved outwards by one common distance where a set is empty.
 
-    With `flat`, also where they have no interior. The distance is the least with which a set has an interior of the
-    depth `_ROOM`: its points violate the constraint by no more than the least possible violation and `_ROOM`. A row
-    0 <= b < 0 is left out, as no action meets it.
+    `flat` widens sets without interior too. The distance is the least that gives a set an interior of depth `_ROOM`, so
+    its points violate the constraint by no more than the least possible violation plus `_ROOM`. A row 0 <= b < 0 is
+    dropped, because no action satisfies it.
     """
     excess = least_excess(sets)
     growth = torch.where(excess > (-_ROOM if flat else NO_INTERIOR), excess * (1.0 + _SHARE) + _ROOM, 0.0)

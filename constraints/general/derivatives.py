@@ -11,18 +11,18 @@ from constraints.numerics import one_where_zero, refuse_second_derivatives, time
 
 # Constraints with less slack than this are active in the Jacobian.
 _ACTIVE = 1e-9
-# A unit normal depends on others where its part outside their span is shorter than this.
+# A unit normal depends on others if its part outside their span is shorter than this.
 _IN_SPAN = 1e-6
-# Singular values of unit normals below this are 0 up to rounding, and so are residuals of sums of them.
+# Singular values of unit normals, and residuals of sums of them, below this are 0 up to rounding.
 _RANK = 1e-7
 
 
 def projection_jacobian(sets: ScaledSets, solution: Tensor, hessian: Tensor, multipliers: Tensor) -> Tensor:
-    """Jacobian (n, d, d) of the projection in the target: the Hessian's inverse on the subspace that the active
-    constraints leave.
+    """Jacobian (n, d, d) of the projection with respect to the target: the inverse Hessian on the free subspace.
 
-    An active constraint without multiplier is a kink and does not count. The exception: where such constraints block
-    each other within the subspace that the others leave, as at the apex of a pyramid, they all count.
+    The free subspace is orthogonal to the normals of the active constraints. An active constraint with multiplier 0 is
+    a kink and does not count, with one exception: if such constraints block each other within the subspace that the
+    others leave, as at the apex of a pyramid, they all count.
     """
     return _on_free_space(_free_space(sets, solution, multipliers)[0], hessian)
 
@@ -30,11 +30,11 @@ def projection_jacobian(sets: ScaledSets, solution: Tensor, hessian: Tensor, mul
 def with_derivatives(
     traced: ScaledSets, target: Tensor, solution: Tensor, hessian: Tensor, multipliers: Tensor
 ) -> Tensor:
-    """The projection `solution` (n, d) of the target (n, d), differentiable by it and by what the sets depend on.
+    """The projection `solution` (n, d) of the target (n, d), differentiable in the target and in the sets.
 
-    Its conditions are target - a - sum lam_j grad g_j(a) = 0 and g_j(a) = 0 for the constraints that hold it, and here
-    solution and multipliers are constants in them, so that only the sets and the target change them: by du and dw. Then
-    da = F du + (1 - F H) N+ dw, with the Jacobian F, the Hessian H and the pseudo-inverse N+ of the normals.
+    The solution a satisfies target - a - sum lam_j grad g_j(a) = 0 and, for the constraints that hold it, g_j(a) = 0.
+    With a and lam held fixed, changes of the target and the sets change the first by du and the slacks -g_j(a) by dw.
+    Then da = F du + (1 - F H) N+ dw, with the Jacobian F, the Hessian H and the pseudo-inverse N+ of the normals.
     """
     sets = traced.detach()
     with torch.no_grad():
@@ -103,7 +103,7 @@ def _null_projector(normals: Tensor, holding: Tensor) -> Tensor:
 def _blocked(normals: Tensor) -> Tensor:
     """Which (m,) of the normals (m, d) are orthogonal to every v with normals @ v <= 0.
 
-    Those are the normals whose negative is a sum of the others with weights >= 0.
+    These are the normals whose negative is a sum of the others with weights >= 0.
     """
     from scipy.optimize import nnls
 

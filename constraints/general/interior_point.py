@@ -1,8 +1,8 @@
 """Second-order cone programs in batch, by a primal-dual interior-point method.
 
 Mehrotra's predictor-corrector steps with Nesterov and Todd's scaling (Vandenberghe 2010, "The CVXOPT linear and
-quadratic cone program solvers"). It treats an ellipse as a cone. As a smooth function of the point, an ellipse could
-stop Newton's steps at the boundary of a thin set, far from the solution.
+quadratic cone program solvers"). The method treats an ellipse as a cone. If it were treated as a smooth function of the
+point, Newton's steps could stop at the boundary of a thin set, far from the solution.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ def solve_cone_programs(
     """argmin y (n, d) of curvature |y|^2 / 2 - <gradient, y> subject to rows (n, m, d) @ y <= bounds (n, m) and
     u_0 >= |(u_1, ..., u_q)| for u = offset (n, k, 1 + q) - matrix (n, k, 1 + q, d) @ y.
 
-    curvature is (n, 1); gradient and start, any point, are (n, d). The objective and constraints should be of order 1.
-    A sample ends when the mean product of slack and multiplier is `accuracy`. Also returns the multipliers (n, m + k)
-    of the rows and the u_0, and whether (n,) the method converged. Where it did not, the point is the best one that it
-    found. From a strictly feasible start, all points are feasible.
+    curvature is (n, 1); gradient and start (any point) are (n, d). The objective and constraints should be of order 1.
+    A sample ends when the mean product of slack and multiplier is at most `accuracy` and the residual at most 100 times
+    that. Also returns the multipliers (n, m + k) of the rows and the u_0, and whether (n,) the method converged. If it
+    did not, the point is the best one found. From a strictly feasible start, all points are feasible.
     """
     m, (k, q, dim) = rows.shape[1], matrix.shape[1:]
     count = len(rows)
@@ -48,7 +48,7 @@ def solve_cone_programs(
     def cone_part(vector: Tensor) -> Tensor:
         return vector[:, m:].unflatten(1, (k, q))
 
-    # Every slack times its multiplier is the same, as on the central path.
+    # Start as on the central path: the product of slack and multiplier is the same for all constraints.
     point = start
     slack = limits - times(stacked, point)
     tail = torch.linalg.vector_norm(cone_part(slack)[..., 1:], dim=-1)

@@ -18,13 +18,16 @@ from constraints.implicit import tensors_of
 class Intersection(GeneralConstraint):
     """The actions that all of `constraints` allow.
 
-    Each is a constraint of this package, a user's own with `explicit`, or another intersection; ValueError for none, or
-    for different dimensions. `penalty` is the sum of their penalties, `violation` the largest violation. `center` is
-    that of a LinearConstraint if all are linear. With an ellipse it is the origin where that is interior, otherwise the
-    point nearest to the origin of those at least 0.9 times as deep as the deepest, and a mean of both where the origin
-    is near the boundary. It is continuous in the coefficients. Methods raise a ConstraintError
-    as those of LinearConstraint and QuadraticConstraint do. `on_empty` decides for the whole; that of a part does
-    not count.
+    Each is a constraint of this package, your own class with `explicit`, or another intersection. ValueError if there
+    is none, or for different dimensions. `penalty` is the sum of their penalties, `violation` their largest violation.
+
+    `center` is continuous in the coefficients. If all parts are linear, it is the centre of a LinearConstraint with all
+    their rows. With an ellipse, it is the origin if that is well inside the set. Otherwise it is the point nearest to
+    the origin among those at least 0.9 times as deep as the deepest, or a mean of both if the origin is near the
+    boundary.
+
+    Methods raise the ConstraintErrors of LinearConstraint and QuadraticConstraint. `on_empty` applies to the whole set;
+    the `on_empty` of a part is ignored.
     """
 
     def __init__(self, *constraints: Constraint, on_empty: OnEmpty = "error"):

@@ -1,4 +1,4 @@
-"""Half-spaces of one's own: A(obs) a <= b(obs) in the box, with any number of rows."""
+"""Linear constraints of your own: A(obs) a <= b(obs) in the box, with any number of rows."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from constraints.numerics import safe_sqrt, times
 class LinearConstraint(GeneralConstraint):
     """A(obs) a <= b(obs) in the box [-1, 1]^dim.
 
-    Pass A and b as functions, or override them in a subclass; TypeError where one is missing. `center` is the point
-    nearest to the origin of those that are at least 0.9 times as deep as the Chebyshev centre: it is unique and
-    continuous in A and b, and 0 in coordinates that no row uses. Methods raise a ConstraintError for NaN or infinite
-    observations or coefficients, wrong shapes and an empty set; `center`, and methods that need one, also for a set
-    without interior. It names the sample, and the row where there is one.
+    Pass A and b as functions, or override them in a subclass; TypeError if one is missing. `center` is the point
+    nearest to the origin among those at least 0.9 times as deep as the Chebyshev centre. It is unique, continuous in A
+    and b, and 0 in coordinates that no row uses.
+
+    Methods raise a ConstraintError for NaN or infinite observations or coefficients, wrong shapes and an empty set.
+    `center` and methods that need a centre also raise it for a set without interior. The error names the sample and, if
+    one row is the cause, the row.
     """
 
     def __init__(
@@ -39,7 +41,7 @@ class LinearConstraint(GeneralConstraint):
         self._A, self._b = A, b
 
     def A(self, obs: Tensor) -> Tensor:
-        """Rows (..., m, d) at obs (..., n), which is float64; they are scaled to unit norm where that matters."""
+        """Rows (..., m, d), of any norm, at obs (..., n), which is float64. Methods scale them to unit norm."""
         if self._A is None:
             raise TypeError(f"{type(self).__name__} needs A(obs)")
         return self._A(obs)

@@ -1,10 +1,9 @@
-"""Linear programs on rows, in batch: the dual simplex method, and projections of points far away where it fails.
+"""Linear programs on rows, in batch: the dual simplex method and, if it fails, projections of far points.
 
 The simplex method keeps a basis of rows that hold the objective with multipliers >= 0, and exchanges one of them for
-the most violated row. Its answer is checked. Where it does not pass, as with rows that are parallel up to rounding,
-the second method takes over: the projection of x + R g is the point with the largest product with g once R is large
-enough (Mangasarian and Meyer 1979, "Nonlinear perturbation of linear programs"). So there is an answer wherever there
-is a projection.
+the most violated row. Its answer is checked. If it is wrong, for example for rows that are parallel up to rounding, the
+second method takes over: the projection of x + R g is the point with the largest product with g once R is large enough
+(Mangasarian and Meyer 1979, "Nonlinear perturbation of linear programs"). So every set with a projection has an answer.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from constraints.numerics import times
 _PIVOT = 1e-9
 # Violations and negative multipliers of the simplex method's answer up to this are rounding.
 _ROUNDING = 1e-10
-# Finished programs leave the batch when they are this share of it.
+# Finished programs are removed from the batch once they exceed this share of it.
 _LEAVING = 0.3
 # The first R, the factor by which it grows, and the loss that ends its growth.
 _FIRST, _GROWTH, _LOSS = 1e3, 30.0, 1e-11
@@ -32,8 +31,8 @@ def maximize_on_rows(
 ) -> tuple[Tensor, Tensor]:
     """argmax (n, k) of <slope, y> subject to rows (n, m, k) @ y <= bounds (n, m), and multipliers (n, m).
 
-    `slope` (n, k) is of order 1. `basis` (n, k) are indices of rows that hold it: it is their sum with weights >= 0.
-    Rows, errors and the other arguments are as in `project_on_rows`.
+    `slope` (n, k) is of order 1. `basis` (n, k) are indices of rows of which `slope` is a sum with weights >= 0. Rows,
+    errors and the other arguments are as in `project_on_rows`.
     """
     solution, multipliers, solved = _dual_simplex(rows, bounds, slope, basis)
     left = (~solved).nonzero().squeeze(-1)
@@ -47,13 +46,13 @@ def _dual_simplex(rows: Tensor, bounds: Tensor, slope: Tensor, basis: Tensor) ->
     """As `maximize_on_rows`; also whether (n,) a sample is solved, up to rounding."""
     m, dim = rows.shape[1:]
     held = rows.take_along_dim(basis.unsqueeze(-1), 1)  # (n, position in the basis, k)
-    # Every row as a sum of those in the basis, with the slack at the point where these meet.
+    # Every row as a combination of the rows in the basis, and its slack at the point where those meet.
     tableau = torch.linalg.solve_ex(held, rows, left=False)[0]
     weight = torch.linalg.solve_ex(held.mT, slope.unsqueeze(-1))[0].squeeze(-1)
     slack = bounds - times(tableau, bounds.gather(-1, basis))
     final, sample = basis.clone(), torch.arange(len(rows), device=rows.device)
     for _ in range(10 * (m + dim)):
-        # The row that is furthest away in the tableau's metric: it takes half as many exchanges as the lowest slack.
+        # Enter the most violated row in the tableau's metric: this takes half as many exchanges as the lowest slack.
         entering = (slack / (1.0 + tableau.square().sum(-1)).sqrt()).argmin(-1, keepdim=True)
         lowest = slack.gather(-1, entering)
         pivots = tableau.take_along_dim(entering.unsqueeze(-1), 1).squeeze(1)
@@ -80,7 +79,7 @@ def _dual_simplex(rows: Tensor, bounds: Tensor, slope: Tensor, basis: Tensor) ->
         change = pivots.scatter_add(-1, leaving, torch.full_like(pivot, -1.0)) / pivot
         tableau = torch.addcmul(tableau, column.unsqueeze(-1), change.unsqueeze(1), value=-1.0)
         basis = basis.scatter(-1, leaving, torch.where(still, basis.gather(-1, leaving), entering))
-    # The tableau has gathered rounding. From the basis itself:
+    # The tableau has accumulated rounding. Solve again from the basis itself.
     held = rows.take_along_dim(final.unsqueeze(-1), 1)
     solution = torch.linalg.solve_ex(held, bounds.gather(-1, final).unsqueeze(-1))[0].squeeze(-1)
     weight = torch.linalg.solve_ex(held.mT, slope.unsqueeze(-1))[0].squeeze(-1)

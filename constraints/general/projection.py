@@ -2,9 +2,9 @@
 
 - On rows alone: a dual active-set method, exact to rounding. It is faster than a loop over OSQP, and stays exact for
   points far away, where OSQP stops converging.
-- With ellipses: Newton's method, which finds the active constraints of most samples. Where it does not, an
-  interior-point method finds them, then Newton's method again, exact to rounding. Where that is not the solution:
-  sequential quadratic programming with the active-set method, from the deepest point.
+- With ellipses: Newton's method, which finds the active constraints of most samples. If it fails, an interior-point
+  method finds them, and Newton's method runs again, exact to rounding. If that fails too, sequential quadratic
+  programming with the active-set method starts from the deepest point.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from constraints.general.interior_point import solve_cone_programs
 from constraints.general.scaled_sets import ScaledSets, guessed_points
 from constraints.numerics import one_where_zero, times
 
-# The interior-point method's accuracy. Its multipliers have to tell active constraints from others, no more.
+# The interior-point method's accuracy. Its multipliers only have to tell active constraints from others.
 _ACCURACY = 1e-9
-# Newton's method starts so near that it converges in this many steps or has the wrong active constraints.
+# Newton's method starts close to the solution: it converges in this many steps, or its active constraints are wrong.
 _NEWTON_STEPS = 4
-# From a guess it may find the active constraints by itself. If not after this many steps, then hardly ever.
+# From a guess, Newton's method may find the active constraints itself. After this many steps it hardly ever does.
 _GUESSING_STEPS = 10
-# Newton's error is of the order of its last step's square: after one this long, it is rounding.
+# Newton's error is about the square of its last step: after a step no longer than this, it is rounding.
 _LAST_NEWTON_STEP = 1e-9
 # A solution may leave the set by this much. `violation` reports it as rounding.
 _OUTSIDE = 1e-12
@@ -33,8 +33,8 @@ _OUTSIDE = 1e-12
 _MAX_PROGRAMS = 60
 # The longest last step with which a sample counts as solved. Convergence is quadratic, so its error is rounding.
 _LAST_PROGRAM_STEP = 1e-9
-# The linear oracle as a projection: of a point this far along the slope. One step leaves the square of the error over
-# the step's length, so three are exact to rounding.
+# The linear oracle projects a point this far along the slope. One step leaves the square of the error over the step's
+# length, so three steps are exact to rounding.
 _PROXIMAL_STEP = 1e3
 _PROXIMAL_STEPS = 3
 
@@ -67,7 +67,7 @@ def optimal_points(sets: ScaledSets, aim: Tensor, linear: bool) -> tuple[Tensor,
     solution, exact, done = _newton(sets, target, point, multipliers)
     left = (~done).nonzero().squeeze(-1)
     if len(left) > 0:
-        # From the deepest point: a start near the boundary may be what went wrong. Raises where there is no interior.
+        # Start from the deepest point, as a start near the boundary may be the cause. This needs an interior.
         part = sets[left]
         inside = deepest_points(part)
         target, point, multipliers = _near_optimum(part, aim[left], linear, inside)
@@ -99,15 +99,16 @@ def _minimize_quadratic(sets: ScaledSets, start: Tensor, curvature: Tensor, grad
     zero = torch.zeros_like(start)
     curvature = curvature / size
     point, dual, _ = solve_cone_programs(curvature, gradient, sets.rows, bounds, matrix, offset, zero, _ACCURACY)
-    # In units of a. An ellipse bounds the square of what its cone bounds, hence half.
+    # Back to units of a. An ellipse bounds the square of what its cone bounds, hence half.
     m = sets.rows.shape[1]
     return start + point / size, torch.cat((dual[:, :m], 0.5 * dual[:, m:] / size), -1)
 
 
 def _first_guess(sets: ScaledSets, target: Tensor) -> tuple[Tensor, Tensor]:
-    """A point (n, d) near the projection of the target (n, d), and multipliers (n, m + k) that may be those there.
+    """A point (n, d) near the projection of the target (n, d), and a guess of the multipliers (n, m + k).
 
-    It is moved into the box, then straight to the centre of the ellipse that it is furthest out of.
+    The target is clamped to the box, then moved towards the centre of the ellipse that it exceeds most, onto that
+    ellipse.
     """
     point = target.clamp(-1.0, 1.0)
     value = sets.ellipse_values(point)[0]
@@ -124,9 +125,9 @@ def _first_guess(sets: ScaledSets, target: Tensor) -> tuple[Tensor, Tensor]:
 def _newton(
     sets: ScaledSets, target: Tensor, point: Tensor, multipliers: Tensor, guess: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Newton's method on the optimality conditions, with those constraints active whose multiplier exceeds their slack.
+    """Newton's method on the optimality conditions, with the constraints active whose multiplier exceeds their slack.
 
-    These are the constraints of the start or, for a start that is a `guess`, of each step anew. Returns point,
+    The active constraints are those of the start or, if the start is a `guess`, those of each step. Returns point,
     multipliers, and whether (n,) these are the solution.
     """
     d = sets.dim
@@ -143,7 +144,7 @@ def _newton(
         normals = normals.take_along_dim(slot.unsqueeze(-1), 1) * used.unsqueeze(-1)
         top = torch.cat((_hessian(sets, multipliers), normals.mT), -1)
         system = torch.cat((top, torch.cat((normals, -idle), -1)), 1)
-        # Solved for the change of the multipliers: those of points far away are large, and so is their rounding.
+        # Solve for the change of the multipliers: for far points the multipliers are large, and so is their rounding.
         held = multipliers.gather(-1, slot) * used
         rest = target - point - times(normals.mT, held)
         right = torch.cat((rest, slack.gather(-1, slot) * used), -1)

@@ -1,4 +1,4 @@
-"""An ellipse of one's own: (a - c(obs))' Q(obs) (a - c(obs)) <= bound(obs) in the box."""
+"""An ellipse of your own: (a - c(obs))' Q(obs) (a - c(obs)) <= bound(obs) in the box."""
 
 from __future__ import annotations
 
@@ -20,13 +20,15 @@ Coefficient = Callable[[Tensor], Tensor]
 class QuadraticConstraint(GeneralConstraint):
     """(a - c(obs))' Q(obs) (a - c(obs)) <= bound(obs) in the box [-1, 1]^dim, Q positive semi-definite, bound > 0.
 
-    Pass Q, bound (a function or a number) and c (default: the origin), or override them in a subclass; TypeError where
-    Q or bound is missing. `center` is c. Where c is not inside the box, it is the point nearest to c of those at least
-    0.9 times as deep in the set as the deepest; where c is near the box's boundary, a mean of both. It is continuous in
-    the coefficients. Methods raise a ConstraintError that names the sample for NaN or infinite observations or
-    coefficients, wrong shapes, a Q that is not positive semi-definite, a bound that is not positive, and an empty set.
-    A set without interior is nowhere deeper than 1e-9: `center`, and methods that need one, raise for it, `project` and
-    `linear_oracle` only where it leaves no unique multipliers.
+    Pass Q, bound (a function or a number) and c (default: the origin), or override them in a subclass; TypeError if Q
+    or bound is missing. `center` is c if that is well inside the box. If c is outside, it is the point nearest to c
+    among those at least 0.9 times as deep in the set as the deepest; if c is near the box's boundary, it is a mean of
+    both. It is continuous in the coefficients.
+
+    Methods raise a ConstraintError that names the sample for NaN or infinite observations or coefficients, wrong
+    shapes, a Q that is not positive semi-definite, a bound that is not positive, and an empty set. A set has no
+    interior if it is nowhere deeper than 1e-9. `center` and methods that need a centre then raise the error; `project`
+    and `linear_oracle` raise it only if the multipliers are not unique.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A batch of sets as the solvers take it: flattened, scaled, on the CPU, the box among the rows."""
+"""A batch of sets in the solvers' format: flattened, scaled, on the CPU, with the box among the rows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from constraints.base import ExplicitSet
 from constraints.errors import EmptySetError, SampleName, name_samples, require
 from constraints.numerics import one_where_zero, times
 
-# The set is empty where its constraints miss each other by more than this. A smaller gap is rounding.
+# A set is empty if its constraints miss each other by more than this. A smaller gap is rounding.
 EMPTY = 1e-8
 # A set whose deepest point is no deeper than this has no interior.
 NO_INTERIOR = 1e-9
@@ -74,7 +74,7 @@ class ScaledSets:
         return ScaledSets(self.rows.detach(), self.bounds.detach(), matrix, center, root, self.name)
 
     def inner(self, depth: Tensor) -> ScaledSets:
-        """The sets of the points that are at least this deep (n,), in the sense of `depth`."""
+        """The subsets of points that are at least this deep (n,), as measured by the method `depth`."""
         distance = depth.unsqueeze(-1)
         matrix = self.matrix / (1.0 - distance / self.root).square()[..., None, None]
         return replace(self, bounds=self.bounds - distance * self.solid, matrix=matrix, root=self.root - distance)
@@ -116,18 +116,18 @@ class ScaledSets:
 
 
 def scale_sets(written: ExplicitSet, lead: tuple[int, ...], check: bool = True) -> ScaledSets:
-    """The sets of a batch of shape `lead`. An EmptySetError names a row that no point of the box meets, if `check`."""
+    """The sets of a batch of shape `lead`. With `check`, EmptySetError for a row that no point of the box satisfies."""
     rows, bounds = unit_rows(written.rows, written.bounds)
     m, d = rows.shape[-2:]
     count = math.prod(lead)
     rows = rows.expand(*lead, m, d).reshape(count, m, d).cpu()
     bounds = bounds.expand(*lead, m).reshape(count, m).cpu()
-    # A row that touches the box in a face, an edge or a corner is met there.
+    # A row that touches the box in a face, an edge or a corner is satisfied there.
     reach = rows.abs().sum(-1)
     met = torch.where(reach > 0.0, bounds >= -reach - EMPTY, bounds >= 0.0)
     if check:
         require(met, "the set is empty", name_samples(tuple(lead)), EmptySetError)
-    # 0 <= 0 holds everywhere, with slack.
+    # The row 0 <= 0 holds everywhere: give it slack.
     bounds = torch.where((rows == 0.0).all(-1) & (bounds == 0.0), 1.0, bounds)
     faces = torch.eye(d, dtype=rows.dtype, device=rows.device).expand(len(rows), d, d)
     rows = torch.cat((rows, faces, -faces), 1)

@@ -1,4 +1,4 @@
-"""A constraint on actions in the units of the robot, made one on normalised actions."""
+"""A constraint on actions in the units of the robot, turned into one on normalised actions."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from constraints.general.quadratic import QuadraticConstraint
 class InUnits(GeneralConstraint):
     """The normalised actions a in [-1, 1]^d for which `constraint` allows u = low + (a + 1) / 2 (high - low).
 
-    `constraint` is in the units of u, such as newton metres. It has to write out its rows and ellipses (`explicit`),
-    as LinearConstraint, QuadraticConstraint and Intersection do. Its own box [-1, 1]^d does not count: the box of u is
-    [low, high]. `low` and `high` are numbers or (d,), as of a `gymnasium.spaces.Box`; ValueError where they are not
-    finite or low is not below high.
+    `constraint` is in the units of u, such as newton metres. It must implement `explicit`, as LinearConstraint,
+    QuadraticConstraint and Intersection do. Its own box [-1, 1]^d is ignored: the box of u is [low, high]. `low` and
+    `high` are numbers or (d,), like the bounds of a `gymnasium.spaces.Box`; ValueError if they are not finite or low is
+    not below high.
 
-    An empty set means what it means to `constraint` (`on_empty`). Violations and penalties are those of the rows and
-    ellipses of a, each scaled as `Constraint.violation` says.
+    Empty sets are handled as `constraint.on_empty` says. Violations and penalties are those of the rows and ellipses in
+    a, each scaled as `Constraint.violation` says.
     """
 
     def __init__(self, constraint: Constraint, low: ArrayLike, high: ArrayLike):
@@ -48,7 +48,7 @@ class InUnits(GeneralConstraint):
         written = self._normalised(obs)
         rows, bounds, ellipses = written
         linear: list[Constraint] = [LinearConstraint(self.dim, lambda _: rows, lambda _: bounds)]
-        # The set at these observations alone, as the intersection of its rows and its ellipses.
+        # The set at just these observations, as the intersection of its rows and its ellipses.
         normalised = Intersection(*linear, *(_constant_ellipse(self.dim, ellipse) for ellipse in ellipses))
         at = normalised._coefficients(obs)
         return At(obs, list(at), lambda: written, (normalised, at))

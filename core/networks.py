@@ -19,7 +19,7 @@ class Linear(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]):
         super().__init__()
-        # PyTorch's own initialisation of nn.Linear, as in the paper's code base. (Without inputs, there is only a bias.)
+        # PyTorch's own initialisation of nn.Linear, as in the paper's code base. (Without inputs, only a bias is left.)
         bound = 1 / math.sqrt(max(inputs, 1))
         weight = torch.empty(len(generators), inputs, outputs)
         bias = torch.empty(len(generators), 1, outputs)

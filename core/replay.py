@@ -69,7 +69,7 @@ class Replay:
         return self._rows
 
     def add(self, which: Sequence[int], transitions: Batch) -> None:
-        """Append one transition to each seed in the positions `which`. All columns are (seeds, features), rewards too."""
+        """Append a transition to each seed in the positions `which`. All columns are (seeds, features), rewards too."""
         which = list(which)
         rows = torch.cat([column for column in transitions if column is not None], dim=-1)
         self.waiting.append(rows if which == self.everyone else rows[which])

@@ -347,7 +347,7 @@ def _batch(agent: Agent, number: int) -> Batch:
 
 
 class _Drift(gymnasium.Env):
-    """A drifting point, pushed by actions. Episodes have 5 to 9 steps. They terminate if that is odd, else truncate."""
+    """A drifting point, pushed by actions. Episodes of 5, 7 or 9 steps terminate, those of 6 or 8 are truncated."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBS,), np.float64)
     largest_violation, executed_actions = -np.inf, 0

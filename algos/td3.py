@@ -141,7 +141,7 @@ class TD3(Agent):
         return batch.reward + self.config.gamma * (1 - batch.terminated) * next_q
 
     def target_action(self, batch: Batch) -> Tensor:
-        """The target actor's action, as the critic sees it, with clipped noise, then limited by the map."""
+        """The target actor's action, as the critic sees it, with clipped noise, put back by `Map.limit_target`."""
         action = self.suggest(self.actor_target, batch.next_obs)
         if self.placement != "environment":
             action = self.feasible(batch.next_obs, action, batch.next_center)

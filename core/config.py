@@ -146,7 +146,7 @@ class Config:
 
 @dataclass
 class PenaltyConfig(Config):
-    """The settings of an algorithm whose name ends in +: they include the weight of the penalty."""
+    """The settings of an algorithm whose name ends in +, with the weight of the penalty."""
 
     penalty: float = setting(1.0, "names with +: weight of the penalty", NOT_NEGATIVE)
 
@@ -263,7 +263,7 @@ def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
 
 
 def _check_company(config: Config, overrides: Iterable[str]) -> None:
-    """Raise ConfigError for a setting that does not apply with the value of another one (`only_with`)."""
+    """Raise ConfigError for an override whose condition `only_with` does not hold."""
     for key, f in keys_of(config).items():
         if key in overrides and (needed := f.metadata.get("only_with")):
             other, value = needed

@@ -31,7 +31,7 @@ POOL = 100_000
 HELD_OUT = 4_000
 """The number of states for the measures, from parts of random play that the training does not use."""
 FURTHEST = 4.0
-"""The largest factor on a state's distance from the mean: a trained policy moves faster than random play."""
+"""The largest factor on a state's distance from the mean: a trained policy moves faster than a random one."""
 SCALING = 1_000
 """The number of actions that set the flow's scales for `reverse`. For `mle`, all actions do."""
 LARGEST_STEP = 0.1

@@ -17,7 +17,7 @@ from constraints.ray import Ray
 from core.evaluation import StepTogether, refusal
 
 Rows = Sequence[int] | None
-"""For each row of a batch, the row that is used in its place; None if every row is used itself."""
+"""For each row of a batch, the row that is used in its place; None if each row stands for itself."""
 
 
 class Guard:
@@ -94,7 +94,7 @@ class Guard:
                 self._refuse(error, obs, rows)
 
     def _rows(self, obs: Tensor) -> Rows:
-        """The row of `obs` to use in the place of each row: itself, or a sound one if its seed is refused."""
+        """For each row of `obs`, the row to use in its place: itself, or a sound one if its seed is refused."""
         if not self.refused or not self._has_seeds(obs):
             return None
         sound = [k for k, position in enumerate(self.positions) if position not in self.refused]

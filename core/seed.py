@@ -94,7 +94,7 @@ class Seed:
         self.recorded = True
 
     def state(self) -> dict[str, Any]:
-        """The content of a checkpoint that this object owns."""
+        """This object's part of a checkpoint."""
         return {
             "counters": {name: getattr(self, name) for name in COUNTERS},
             "suggestions": asdict(self.suggestions),

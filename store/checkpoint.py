@@ -67,7 +67,7 @@ class Checkpoint:
     replay_files: tuple[ReplayFile, ...]
 
     def state(self) -> dict[str, Any]:
-        """The state that `CheckpointFolder.write` was given."""
+        """The state that `CheckpointFolder.write` received."""
         return load_tensors(self.path)["state"]
 
     def fill(self, stretch: Stretch, oldest: int) -> None:
@@ -121,7 +121,7 @@ class CheckpointFolder:
         self.written = files
 
     def keep(self) -> None:
-        """Make the written checkpoint the newest one, and delete all but the one before it."""
+        """Make the written checkpoint the newest one. Of the older ones, keep only the one before it."""
         self.serial, self.files, self.previous_files = self.serial + 1, self.written, self.files
         self.discard()
 

@@ -30,7 +30,7 @@ def replace_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
 
 
 def user_path(text: str | Path) -> Path:
-    """The path that a user means: a leading ~ is their home, ~name that of another user, if there is one."""
+    """The path that a user means: a leading ~ is their home, ~name the home of another user, if there is one."""
     return Path(os.path.expanduser(text))  # Path.expanduser raises RuntimeError for an unknown name
 
 

@@ -41,8 +41,8 @@ def source_of(value: types.FunctionType | type) -> str:
     try:
         if value.__name__ == "<lambda>":
             return _lambda_source(value)
-        # For a function made by a decorator, `__code__` leads to the decorator's source, the function itself to the
-        # decorated function's.
+        # For a function made by a decorator, `__code__` leads to the source of the wrapper, and the function itself to
+        # the source of the decorated function.
         return _bare(textwrap.dedent(inspect.getsource(getattr(value, "__code__", value))))
     except (OSError, TypeError, SyntaxError, IndentationError, tokenize.TokenError):
         return ""

@@ -1,8 +1,7 @@
 """The training loop: S seeds of one (algorithm, task) cell in one process.
 
-Each seed follows its own schedule of rollouts and gradient steps, exactly as it would alone. The seeds share only the
-arithmetic: a seed that owes gradient steps waits until all seeds do. They then take them in one batch of matrix
-products.
+Each seed follows its own schedule of rollouts and gradient steps, exactly as it would alone. Only the arithmetic is
+shared: a seed that owes gradient steps waits until all do. They take these steps in one batch of matrix products.
 """
 
 from __future__ import annotations
@@ -159,8 +158,7 @@ class Trainer:
     def _advance(self, live: Sequence[Seed]) -> None:
         """Take the next step of the seeds that have not ended.
 
-        The step depends on the state alone. A training that resumes from a checkpoint between two calls is therefore
-        the same training.
+        The step depends on the state alone. A training that resumes between two calls is thus the same training.
         """
         every, last = self.config.eval_every, self.config.steps
         due = [s for s in live if s.steps > s.evaluated and (s.steps % every == 0 or s.steps == last)]

@@ -1,4 +1,4 @@
-"""The table of algorithms: which class, which feasibility map, where it stands, and whether the penalty is added."""
+"""The table of algorithms: the class, the feasibility map, its placement, and whether the penalty is added."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from store.info import missing_plugin
 
 @dataclass(frozen=True)
 class Algorithm:
-    """One column of the table. Raises ValueError, with the reason, for a combination that is not implemented."""
+    """One row of the table. Raises ValueError, with the reason, for a combination that is not implemented."""
 
     agent: type[Agent]
     map: Map
@@ -50,7 +50,7 @@ class Algorithm:
 
     @property
     def _bases(self) -> tuple[type[Config], ...]:
-        """The dataclasses of the settings that are not the map's."""
+        """The dataclasses of the settings that do not belong to the map."""
         return (self.agent.config_class, *([PenaltyConfig] if self.penalty else []))
 
     def _check_settings(self) -> None:
@@ -68,7 +68,7 @@ class Algorithm:
                     raise ValueError(f"{schema.__name__}.{f.name} must be made with core.config.setting")
 
     def paper_config(self, name: str, task: str, group: str, steps: int) -> Config:
-        """The settings of the paper's table for a `group` of robots; "Others" where the algorithm has no such row."""
+        """The settings of the paper's table for a `group` of robots; "Others" if the algorithm has no such group."""
         paper = self.agent.paper
         return self.config_class(algo=name, env=task, steps=steps, **paper.get(group, paper["Others"]))
 
@@ -120,13 +120,13 @@ def check_algorithm(name: str) -> None:
 
     Raises `algos.check.ContractError`, whose message names the mistake and the remedy; ConfigError for an unknown name.
     """
-    from algos.check import check  # only here: it trains, and needs what training needs
+    from algos.check import check  # only here: it imports all that training needs
 
     check(known_name("algorithm", name, ALGORITHMS), ALGORITHMS[name])
 
 
 def setting_keys() -> dict[str, Field]:
-    """Every key of the command line, with the field that describes it: first those that all algorithms have."""
+    """Every key of the command line with the field that describes it. Keys of all algorithms come first."""
     keys = keys_of(Config)
     for algorithm in ALGORITHMS.values():
         keys |= {key: f for key, f in keys_of(algorithm.config_class).items() if key not in keys}
@@ -139,16 +139,16 @@ def saved_config(settings: Mapping[str, Any]) -> Config:
 
 
 def load_policy(folder: str | Path, which: str = "best") -> Policy:
-    """The policy of the run in `folder`, which is finished or not: observations (n,) or (m, n) -> executed actions.
+    """Load the policy of the run in `folder`, finished or not: observations (n,) or (m, n) -> executed actions.
 
-    Warns, with a UserWarning, if the task or the algorithm is not what it was in the training. The policy is then
-    feasible under the task's present constraint.
+    Warns, with a UserWarning, if the definition of the task or the algorithm has changed since the training. The
+    policy is then feasible under the task's current constraint.
 
-    `which`: "best" has the parameters of the best evaluation so far, "last" those at the end of the training or, while
-    it is unfinished, of its newest checkpoint. Everything is on the CPU.
+    `which`: "best" loads the parameters of the best evaluation so far, "last" the parameters at the end of the training
+    or, if it is unfinished, in its newest checkpoint. Everything is on the CPU.
 
     Raises ConfigError, a ValueError, for another `which`, for a folder without a run or without these parameters, and
-    for an algorithm or a task that is not known. Import the file that defines your own before.
+    for an unknown algorithm or task. Import the file that defines your own algorithm or task first.
     """
     folder = user_path(folder)
     settings = settings_of(folder)

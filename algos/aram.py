@@ -1,11 +1,11 @@
 """ARAM: SAC with acceptance and rejection in an augmented MDP (Hung, Sun and Hsieh, ICLR 2025).
 
-The policy is asked again until it suggests a feasible action. A rejected suggestion is an experience too: it leads from
-a state back to the same state at the cost of a penalty. So there are two rewards, that of the task and minus the
-penalty, and a preference lambda = (l, 1 - l) that weighs them. Actor and critics know the preference. The critics learn
-both returns, for all preferences at once.
+The policy draws actions until one is feasible. A rejected action is a transition too: it leads from a state back to the
+same state at the cost of a penalty. So there are two rewards, the task's and minus the penalty, and a preference
+lambda = (l, 1 - l) weighs them. The preference is an input of actor and critics. The critics learn both returns, for
+all preferences at once.
 
-Projection is only the way out after many rejections, and of the deterministic policy in evaluations.
+An action is projected only after many rejections, and in evaluations, where the policy is deterministic.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from core.networks import MLP, Adam, Network, frozen_copy, rows_of, soft_update
 from core.replay import Batch
 
 MEASURED_STEPS = 1_000
-"""About so many of the last environment steps count in the measures of acceptance."""
+"""The measures of acceptance are means over about this many of the last environment steps."""
 
 
 @dataclass
 class ARAMConfig(Config):
-    """ARAM's own settings. The defaults are the constants of its published code, but for docs/deviations.md.
+    """ARAM's own settings. The defaults are the constants of its published code, except for docs/deviations.md.
 
-    A rejection costs, beside its penalty, the delay of all later rewards: (1 - gamma) times their value. Where that is
-    not positive, the delay is a gain and works against the penalty. So `reward_shift` can make rewards larger.
+    Besides its penalty, a rejection delays all later rewards, which costs (1 - gamma) times their value. If the value
+    is negative, the delay is a gain and works against the penalty. `reward_shift` can therefore raise the rewards.
     """
 
     temperature: float = setting(0.2, "ARAM: weight of the entropy at the start", POSITIVE)
@@ -55,7 +55,7 @@ class ARAMConfig(Config):
 
 
 class VectorCritic(Network):
-    """`count` Q-functions a seed side by side, each of two returns: that of the task and that of the penalties."""
+    """`count` Q-functions per seed side by side. Each predicts two returns: the task's and the penalties'."""
 
     def __init__(
         self,
@@ -70,7 +70,8 @@ class VectorCritic(Network):
         self.net = MLP([obs_dim + action_dim + 2, *hidden, 2], [*generators] * count)
 
     def forward(self, obs: Tensor, action: Tensor, preference: Tensor) -> Tensor:
-        """Returns (count, seeds, batch, 2) of obs (.., n), action (.., d) and preferences (seeds, 1 or batch, 2)."""
+        """The returns (count, seeds, batch, 2) for obs (seeds, batch, n), action (seeds, batch, d) and preferences
+        (seeds, 1 or batch, 2)."""
         x = with_preference(torch.cat([obs, action], dim=-1), preference)
         q = self.net(x.expand(self.count, *x.shape).flatten(0, 1))
         return q.view(self.count, *x.shape[:2], 2)
@@ -109,13 +110,13 @@ class ARAM(Agent):
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(seeds, *shape, dtype=dtype, device=self.device)
 
-        self.preference = zeros(2)  # of the present episode
-        # The last rejected actions of each seed, with their observations: a ring.
+        self.preference = zeros(2)  # of the current episode
+        # A ring of the last rejected actions of each seed, with their observations.
         self.rejections = zeros(config.rejected_kept, self.obs_dim + self.action_dim)
-        self.rejected, self.steps = (zeros(1, dtype=torch.int64) for _ in range(2))  # actions and steps so far
-        self.measured = torch.zeros(seeds, dtype=torch.int64)  # the steps on the CPU: acting need not wait for a GPU
-        self.missing = zeros(config.snapshots) + torch.inf  # for each earlier critic 0, or inf where there is none yet
-        self.copies = torch.zeros(seeds, dtype=torch.int64)  # of the critic, so far
+        self.rejected, self.steps = (zeros(1, dtype=torch.int64) for _ in range(2))  # counts of actions and steps
+        self.measured = torch.zeros(seeds, dtype=torch.int64)  # `steps` on the CPU: acting does not wait for a GPU
+        self.missing = zeros(config.snapshots) + torch.inf  # 0 for each earlier critic, inf if there is none yet
+        self.copies = torch.zeros(seeds, dtype=torch.int64)  # of the critic so far
         # Means over steps: rejected draws, share of steps that project, share of the draws that are feasible.
         self.measures = torch.zeros(seeds, 3)
         self.entropy = zeros(1)  # of the policy at the last batch's states
@@ -140,14 +141,14 @@ class ARAM(Agent):
 
     @torch.no_grad()
     def clear(self, i: int) -> None:
-        """Forget the rejected actions as well: those of a diverged seed may be NaN."""
+        """Discard the seed's rejected actions as well, which may be NaN after it has diverged."""
         super().clear(i)
         self.rejected[i] = 0
 
     # ---------------------------------------------------------------- acting
 
     def start_episode(self, which: Sequence[int]) -> None:
-        """One preference holds for an episode."""
+        """Draw the preference of each new episode."""
         drawn = preferences(self.exploration.uniform(1, which=which))
         for i in which:
             self.preference[i] = drawn[i]
@@ -156,7 +157,8 @@ class ARAM(Agent):
     def act(self, obs: Tensor, center: Tensor | None, warming_up: Sequence[int], exploring: Sequence[int]) -> Action:
         """Draw until an action is feasible; after `most_rejections` rejected draws, project the last one.
 
-        All draws of all seeds are made and checked at once. Those after the first feasible one only count in a measure.
+        All draws of all seeds are made and checked at once. Draws after the first feasible one count only in
+        `acceptance_rate`.
         """
         seeds, draws = len(self.seeds), self.config.most_rejections
         candidates = torch.zeros(seeds, draws, self.action_dim)
@@ -166,7 +168,7 @@ class ARAM(Agent):
         if exploring:
             candidates[exploring] = self.draw(obs.to(self.device), exploring).cpu()[exploring]
         feasible = self.constraint.violation(obs.unsqueeze(1), candidates) <= 0.0  # a NaN is rejected as well
-        rejected = (~feasible).cumprod(-1).sum(-1)  # (seeds,): those before the first feasible one
+        rejected = (~feasible).cumprod(-1).sum(-1)  # (seeds,): draws before the first feasible one
         exhausted = rejected == draws
         suggested = candidates[torch.arange(seeds), rejected.clamp(max=draws - 1)]
         executed = suggested
@@ -189,10 +191,10 @@ class ARAM(Agent):
     def remember(
         self, which: Sequence[int], obs: Tensor, candidates: Tensor, rejected: Tensor, feasible: Tensor
     ) -> None:
-        """Count a step of the seeds `which` and keep their rejected actions, the first ones of `candidates`.
+        """Count a step of the seeds `which` and store their rejected actions, the first `rejected` of `candidates`.
 
-        obs (seeds, n), candidates (seeds, draws, d), how many are rejected (seeds,) and which share of all candidates
-        is feasible (seeds,) are on the CPU.
+        obs (seeds, n), `candidates` (seeds, draws, d), the counts `rejected` (seeds,) and the shares of feasible
+        candidates `feasible` (seeds,) are on the CPU.
         """
         kept, draws = self.config.rejected_kept, candidates.shape[1]
         stepped = torch.zeros(len(self.seeds), dtype=torch.int64)
@@ -212,7 +214,7 @@ class ARAM(Agent):
         self.measures.lerp_(now, weight.unsqueeze(-1))
 
     def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:
-        """The projected mean, for the preference `eval_preference`."""
+        """The policy's mean action, projected, for the preference (`eval_preference`, 1 - `eval_preference`)."""
         actor, weight = rows_of(self.actor, which), self.config.eval_preference
         preference = torch.tensor([weight, 1.0 - weight], device=self.device)
 
@@ -262,7 +264,7 @@ class ARAM(Agent):
         soft_update(self.critic_target, self.critic, self.config.tau)
 
     def with_rejections(self, batch: Batch) -> Batch:
-        """The batch with rejected actions in its last places: they lead back to where they were, without a reward."""
+        """Put rejected actions into the last places of the batch: transitions back to the same state, with reward 0."""
         config, size = self.config, batch.reward.shape[1]
         places = round(config.rejected_share * size)
         if not places:
@@ -272,7 +274,7 @@ class ARAM(Agent):
         chosen = (number * kept).long().minimum(kept - 1).clamp(min=0)
         rows = self.rejections.gather(1, chosen.unsqueeze(-1).expand(-1, -1, self.rejections.shape[-1]))
         obs, action = rows.split([self.obs_dim, self.action_dim], dim=-1)
-        # The share falls while the shapes stay. No batch has more rejected actions than there are.
+        # The share decays, but the shapes stay. A batch has no more rejected actions than a seed has stored.
         share = config.rejected_share * config.rejected_share_decay ** (self.steps // config.rejected_share_every)
         replace = torch.arange(places, device=kept.device) >= places - (share * size).round().minimum(kept)
 
@@ -290,29 +292,29 @@ class ARAM(Agent):
         )
 
     def best_value(self, obs: Tensor, action: Tensor, preference: Tensor, drawn: Tensor) -> Tensor:
-        """The return (seeds, batch), weighed by `preference`, of the most hopeful critic in each state.
+        """The largest return (seeds, batch), weighed by `preference`, that a critic predicts in each state.
 
-        The critics are the present one and the earlier ones, each asked for every preference that was `drawn`
-        (seeds, k, 2), that of the step among them (Q-Pensieve, Hung et al., ICLR 2023). A gradient has only the choice
-        that is the best one, so the others are computed without.
+        The current critic and the earlier ones are evaluated for every preference in `drawn` (seeds, k, 2), which
+        includes the step's own (Q-Pensieve, Hung et al., ICLR 2023). Only the largest return has a gradient, so the
+        others are computed without one.
         """
         with torch.no_grad():
             worths = torch.stack([self.worths(obs, action, other, preference) for other in drawn.split(1, dim=1)])
-            missing = pad(self.missing.T, (0, 0, 1, 0)).unsqueeze(-1)  # the present critic is there
+            missing = pad(self.missing.T, (0, 0, 1, 0)).unsqueeze(-1)  # the current critic is never missing
             best = (worths - missing).flatten(0, 1).argmax(0)  # (seeds, batch)
             critics = worths.shape[1]
             condition = drawn.gather(1, (best // critics).unsqueeze(-1).expand(-1, -1, 2))
         return self.worths(obs, action, condition, preference).gather(0, (best % critics).unsqueeze(0)).squeeze(0)
 
     def worths(self, obs: Tensor, action: Tensor, condition: Tensor, preference: Tensor) -> Tensor:
-        """The returns (1 + snapshots, seeds, batch) of the present critic and the earlier ones for the preferences
-        `condition` (seeds, 1 or batch, 2), weighed by `preference`; of each pair of twins the smaller one."""
+        """The returns (1 + snapshots, seeds, batch) of the current and the earlier critics, weighed by `preference`. Of
+        each pair of twins, the smaller one counts. The critics' input is `condition` (seeds, 1 or batch, 2)."""
         returns = torch.cat([self.critic(obs, action, condition), self.earlier(obs, action, condition)])
         return (returns * preference).sum(-1).view(-1, 2, *action.shape[:2]).amin(1)
 
     @torch.no_grad()
     def start_rollout(self, which: Sequence[int]) -> None:
-        """Keep a copy of the critic every `snapshot_every` gradient steps, in the place of the oldest one."""
+        """Store a copy of the critic every `snapshot_every` gradient steps, in the place of the oldest copy."""
         config = self.config
         for i in which:
             number = int(self.copies[i])
@@ -325,11 +327,12 @@ class ARAM(Agent):
             self.copies[i] += 1
 
     def statistics(self) -> dict[str, Tensor]:
-        """Measures of the last thousand steps or so: the share of a step's draws that are feasible, rejected draws a
-        step, and the share of steps that project as all draws are rejected. The others are of the last gradient step.
+        """Measures of about the last `MEASURED_STEPS` environment steps, and of the last gradient step.
 
-        The first one weighs each step alike. Accepted draws over all draws until then would not: a few states where
-        nearly no draw is feasible have most of the draws.
+        Of the environment steps: `acceptance_rate` is the share of a step's draws that are feasible, `rejected_draws`
+        the number of rejected draws per step, and `fallbacks` the share of steps that project because all draws are
+        rejected. `acceptance_rate` weighs all steps equally. The number of accepted draws over the number of draws
+        until then would not: most of these draws are in a few states where hardly any draw is feasible.
         """
         rejected, fallbacks, acceptance = self.measures.unbind(-1)
         return {
@@ -343,17 +346,17 @@ class ARAM(Agent):
 
 
 def preferences(drawn: Tensor) -> Tensor:
-    """Preferences (..., 2), uniform on the simplex, of numbers (..., 1) that are uniform in [-1, 1)."""
+    """Turn numbers (..., 1), uniform in [-1, 1), into preferences (..., 2), uniform on the simplex."""
     weight = 0.5 * (drawn + 1.0)
     return torch.cat([weight, 1.0 - weight], dim=-1)
 
 
 def with_preference(obs: Tensor, preference: Tensor) -> Tensor:
-    """A network's input: obs (seeds, batch, n) and preferences (seeds, 1 or batch, 2)."""
+    """Concatenate obs (seeds, batch, n) and preferences (seeds, 1 or batch, 2) to the input of a network."""
     return torch.cat([obs, preference.expand(*obs.shape[:-1], 2)], dim=-1)
 
 
 def smaller_twin(returns: Tensor, preference: Tensor) -> Tensor:
-    """Of the twins' returns (2, seeds, batch, 2), those (seeds, batch, 2) that are worth less to the preference."""
+    """The returns (seeds, batch, 2) of the twin that is worth less under `preference`, out of (2, seeds, batch, 2)."""
     worth = (returns * preference).sum(-1, keepdim=True)
     return torch.where(worth[0] <= worth[1], returns[0], returns[1])

@@ -1,7 +1,6 @@
-"""The contracts of an algorithm, checked: `algos.check_algorithm` is for an algorithm what Gymnasium's check_env is for
-an environment. `core.agent.Agent` says what the contracts are.
+"""Checks an algorithm against its contracts (`core.agent.Agent`), as Gymnasium's check_env checks an environment.
 
-It trains with small networks on a small environment, whose constraint depends on the observation.
+`algos.check_algorithm` trains small networks on a small environment, whose constraint depends on the observation.
 """
 
 from __future__ import annotations
@@ -41,11 +40,11 @@ SMALL: dict[str, Any] = {
     "eval_every": 20, "eval_episodes": 2, "final_episodes": 2, "checkpoint_every": 1000, "device": "cpu", "threads": 1,
 }  # fmt: skip
 TOLERANCE = 1e-6  # of executed actions, as in the environments of the tasks
-ROUNDING = 1e-3  # what rounding can make of a parameter or a transition within so few steps
+ROUNDING = 1e-3  # the largest rounding error of a parameter or a transition after so few steps
 
 
 class ContractError(Exception):
-    """An algorithm breaks a contract of `core.agent.Agent`; the message says which, and what to do."""
+    """An algorithm breaks a contract of `core.agent.Agent`. The message names the contract and the remedy."""
 
 
 def check(name: str, algorithm: Any) -> None:
@@ -62,7 +61,10 @@ def check(name: str, algorithm: Any) -> None:
 
 
 def check_parameters(name: str, alone: Agent, among: Agent) -> None:
-    """Raise ContractError if the agents, one of a single seed and one with others before it, share parameters."""
+    """Raise ContractError if seeds share parameters or if a seed's initial values depend on other seeds.
+
+    `alone` has one seed, `among` the same seed after others.
+    """
     one, several = ({key: tuple(p.shape) for key, p in _parameters(agent).items()} for agent in (alone, among))
     if one.keys() != several.keys():
         raise ContractError(f"{name}: parameters have other names with other numbers of seeds: {one} and {several}")
@@ -104,7 +106,7 @@ class _Check:
 
     @contextmanager
     def _own_randomness(self, when: str) -> Iterator[None]:
-        """Fail if the block draws from a generator that is not the agent's."""
+        """Fail if the block draws from a global random generator."""
         generators: dict[str, Callable[[], Any]] = {
             "PyTorch's global generator": lambda: torch.get_rng_state().tolist(),
             "NumPy's global generator": lambda: str(np.random.get_state(legacy=False)),
@@ -120,7 +122,7 @@ class _Check:
                     " in build"
                 )
 
-    # ---------------------------------------------------------------- what it consists of
+    # ---------------------------------------------------------------- networks, optimisers and memory
 
     def _check_registered(self, agent: Agent) -> None:
         known = {id(parameter): name for name, parameter in _parameters(agent).items()}
@@ -247,7 +249,7 @@ class _Check:
         )
 
     def _train(self, seeds: Sequence[int], interrupted: bool = False) -> dict[int, dict[str, Any]]:
-        """What a training leaves of each seed. If `interrupted`, it is resumed from checkpoints at several moments."""
+        """Train `seeds` and return the outcome of each. If `interrupted`, stop at `MOMENTS` and resume each time."""
         with tempfile.TemporaryDirectory() as root, self._own_randomness("in training"):
             folders = [Path(root, f"seed={seed}") for seed in seeds]
             writers = [RunWriter(folder, {}, {}, self.config.eval_episodes) for folder in folders]
@@ -289,7 +291,7 @@ class _Check:
             self._fail(f"a seed fails at step {seed.failure['step']}: {seed.failure['quantity']}")
         i, tables = seed.position, seed.writer.tables()
         rows = torch.cat(trainer.replay.stretch(i, 0, trainer.replay.added[i]))
-        # (the agent's own parameters of a seed that has ended go on to change with the others')
+        # (in the agent, the parameters of a seed that has ended still change while others train)
         last = torch.load(seed.writer.folder / "last.pt", weights_only=True)
         numbers = {"transitions": rows} | {f"parameter {name}": values for name, values in last.items()}
         for name, text in tables.items():
@@ -315,7 +317,7 @@ MOMENTS: tuple[Callable[[Seed, Config], bool], ...] = (
     lambda seed, config: seed.gradient_steps > 1 and seed.steps % config.eval_every == 0,  # before an evaluation
     lambda seed, config: seed.steps == config.steps - 5,
 )
-"""When a training is interrupted to try whether it resumes."""
+"""The moments at which a training is interrupted to check that it resumes."""
 
 
 def _parameters(agent: Agent) -> dict[str, nn.Parameter]:
@@ -335,7 +337,7 @@ def _pairs(states: list[Tensor], agent: Agent, name: str) -> Iterator[tuple[Tens
 
 
 def _batch(agent: Agent, number: int) -> Batch:
-    """A batch of invented transitions."""
+    """A batch of random transitions."""
     generator = torch.Generator().manual_seed(number)
     obs, next_obs = (torch.randn(len(SEEDS), 8, OBS, generator=generator) for _ in range(2))
     action = CONSTRAINT.project(obs, torch.rand(len(SEEDS), 8, DIM, generator=generator) * 2 - 1)
@@ -345,11 +347,11 @@ def _batch(agent: Agent, number: int) -> Batch:
 
 
 class _Drift(gymnasium.Env):
-    """A point that drifts; its action pushes it. Episodes of 5 to 9 steps, of which those of odd length terminate."""
+    """A drifting point, pushed by actions. Episodes of 5, 7 or 9 steps terminate, those of 6 or 8 are truncated."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBS,), np.float64)
     largest_violation, executed_actions = -np.inf, 0
-    robot = SimpleNamespace(max_episode_steps=9)  # of which a progress bar asks this
+    robot = SimpleNamespace(max_episode_steps=9)  # for the evaluation's progress bar
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)

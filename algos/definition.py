@@ -1,4 +1,4 @@
-"""What a run is trained on, and whether that is still what its names stand for."""
+"""Describes a run's task and algorithm, and tells whether their definitions have changed since its training."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from store.folder import read_definition
 
 
 def define(robot: Any, constraint: Constraint, algorithm: Any) -> dict[str, Description]:
-    """The descriptions of a task (the class of its robot, and its constraint) and of a row of `algos.ALGORITHMS`, as
-    definition.json has them."""
+    """Describe a task (the class of its robot, and its constraint) and a row of `algos.ALGORITHMS`, as definition.json
+    stores them."""
     public = {name: getattr(robot, name) for name in dir(robot) if not name.startswith("_")}
     numbers = {name: value for name, value in public.items() if isinstance(value, (int, float, str))}
     parts: dict[str, Any] = {f"robot.{name}": value for name, value in numbers.items()}
-    if isinstance(identifier := public.get("identifier"), str):  # of a Gymnasium environment, which may be one's own
+    if isinstance(identifier := public.get("identifier"), str):  # a Gymnasium environment, maybe the user's own
         spec = gymnasium.spec(identifier)
         parts |= {"robot.environment": spec.entry_point, "robot.settings": spec.kwargs}
         if isinstance(spec.entry_point, str):
@@ -33,7 +33,7 @@ def define(robot: Any, constraint: Constraint, algorithm: Any) -> dict[str, Desc
 
 
 def changes(folder: Path, now: Mapping[str, Description]) -> str:
-    """What is no longer as when the run in `folder` was trained, in one line; empty where nothing is, or none is known.
+    """What has changed since the run in `folder` was trained, in one line; empty if nothing has, or if it is unknown.
 
     It reads like "another definition of its task: the constraint's bound: 0.05 then, 0.9 now".
     """

@@ -1,7 +1,7 @@
 """NFW: Neural Frank-Wolfe Policy Optimization (Lin et al., 2021) with TD3's techniques (paper, Section "NFWPO").
 
 Critics, exploration and targets are TD3's with projected actions. The actor does not follow the critic's gradient
-through the projection; it is drawn to a reference action that a Frank-Wolfe step finds inside the feasible set.
+through the projection. It regresses on a reference action that a Frank-Wolfe step finds inside the feasible set.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What `algos.load_policy` is made of: the policy that it returns, and the files of a run that it reads."""
+"""The parts of `algos.load_policy`: the policy that it returns, and reading the files of a run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Policy:
     """A deterministic policy, as evaluations run it.
 
     Call it with observations (n,) or (m, n); it returns the executed actions (d,) or (m, d), float32, which are
-    feasible under `constraint`. ValueError for observations of another shape.
+    feasible under `constraint`. Raises ValueError for observations of another shape.
     """
 
     agent: Agent
@@ -40,7 +40,7 @@ class Policy:
 
 
 def settings_of(folder: Path) -> dict[str, Any]:
-    """The configuration in the folder of a run; ConfigError where there is none."""
+    """The configuration in the folder of a run. Raises ConfigError if there is none."""
     settings = read_settings(folder)
     if not all(isinstance(settings.get(key), str) for key in ("algo", "env")):
         raise ConfigError(
@@ -50,8 +50,8 @@ def settings_of(folder: Path) -> dict[str, Any]:
 
 
 def parts_of(task: str) -> tuple[Constraint, type, int]:
-    """A task's constraint, the class of its robot and the length of its observations; ConfigError if it is unknown."""
-    # The tasks are in a room above this one. Gymnasium imports `envs` where a program has not done so.
+    """A task's constraint, the class of its robot and the length of its observations. ConfigError if it is unknown."""
+    # `algos` may not import `envs`, which has the tasks. Gymnasium imports `envs` if a program has not done so.
     env: Any = gymnasium.make("envs:acrl/Task-v0", task=task, disable_env_checker=True)
     found = env.unwrapped.constraint, type(env.unwrapped.robot), env.observation_space.shape[0]
     env.close()
@@ -61,7 +61,7 @@ def parts_of(task: str) -> tuple[Constraint, type, int]:
 def restore(agent: Agent, folder: Path, which: str) -> None:
     """Load the "best" or "last" parameters of the run in `folder` into the only seed of `agent`.
 
-    ConfigError for another `which`, and for parameters that are missing, damaged or of other networks.
+    Raises ConfigError for another `which`, and for parameters that are missing, damaged or of other networks.
     """
     parameters, path = _read_parameters(folder, known_name("parameters", which, ("best", "last")))
     try:
@@ -71,7 +71,7 @@ def restore(agent: Agent, folder: Path, which: str) -> None:
 
 
 def _read_parameters(folder: Path, which: str) -> tuple[dict[str, Tensor], Path]:
-    """The parameters, and the file that has them."""
+    """The parameters, and the path of their file."""
     if which == "last" and not has_ended(folder):
         checkpoints, _ = CheckpointFolder(folder).read()
         if checkpoints:
@@ -84,7 +84,7 @@ def _read_parameters(folder: Path, which: str) -> tuple[dict[str, Tensor], Path]
         raise ConfigError(f"{folder} has no {which} parameters: {reason}")
     try:
         parameters = torch.load(path, weights_only=True)
-    except Exception as error:  # PyTorch raises whatever its unpickler and its archive reader do
+    except Exception as error:  # PyTorch passes on any error of its unpickler or archive reader
         raise ConfigError(f"{path} is damaged: {one_line(error) or type(error).__name__}") from error
     if not isinstance(parameters, dict) or not all(isinstance(value, Tensor) for value in parameters.values()):
         raise ConfigError(f"{path} is damaged: it has no table of tensors")

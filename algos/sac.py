@@ -1,9 +1,9 @@
 """SAC under action constraints: SPre, SPre+, SAlpha, SRad, SGauge and SFlow.
 
 Haarnoja et al. (2018) with a learned temperature and a feasibility map (paper, Section "Incorporating Action
-Constraints to SAC"). The actor's Gaussian is squashed by tanh where the map says so, and the critic sees the result
-(SPre, whose environment projects) or what the map makes of it, with the map's log-density (`core.maps`). On Reacher
-the exploration noise is state-dependent (gSDE, Raffin et al. 2022).
+Constraints to SAC"). The actor's Gaussian is squashed by tanh if the map demands it. The critic sees the result (SPre,
+whose environment projects) or the mapped action, with the map's log-density (`core.maps`). On Reacher the exploration
+noise is state-dependent (gSDE, Raffin et al. 2022).
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ def normal_log_prob(residual: Tensor, log_std: Tensor) -> Tensor:
 def squashed(sample: Sample) -> Sample:
     """The sample after a tanh."""
     raw = sample.suggested
-    # log tanh' = 2 (log 2 - raw - softplus(-2 raw)), exact however far out.
+    # log tanh' = 2 (log 2 - raw - softplus(-2 raw)), accurate for every raw.
     log_slope = -2 * (raw + softplus(-2 * raw)).sum(-1) + 2 * math.log(2) * raw.shape[-1]
     return sample._replace(suggested=raw.tanh(), log_prob=sample.log_prob - log_slope)
 
 
 class GaussianActor(nn.Module):
-    """Mean and standard deviation from one network; noise independent at every step."""
+    """One network gives mean and standard deviation. The noise is independent at every step."""
 
     def __init__(self, obs_dim: int, action_dim: int, hidden: Sequence[int], generators: Sequence[torch.Generator]):
         super().__init__()
@@ -73,7 +73,7 @@ class StateDependentActor(nn.Module):
     """gSDE: noise is latent . theta, so that it varies smoothly with the state while theta stays the same.
 
     theta (latent, d) is normal with standard deviation exp(log_std), hence the noise of one state is normal with
-    variance latent^2 . std^2. The latent features are the last hidden layer's, and noise trains them too.
+    variance latent^2 . std^2. The latent features are the last hidden layer. The noise's gradient trains them too.
     """
 
     MEAN_BOUND = 2.0
@@ -162,7 +162,7 @@ class SAC(Agent):
         return {"rollout_noise": self.rollout_noise, "entropy": self.entropy, **self.last_losses}
 
     def start_rollout(self, which: Sequence[int]) -> None:
-        """gSDE keeps one theta for a rollout."""
+        """With gSDE, draw one theta for the whole rollout."""
         if self.config.gsde:
             fresh = self.exploration.normal(*self.actor.noise_shape, which=which)
             for i in which:
@@ -177,7 +177,7 @@ class SAC(Agent):
 
     @cached_property
     def explored(self) -> Captured:
-        """`noisy_suggestion`, a CUDA graph on a GPU."""
+        """`noisy_suggestion`, as a CUDA graph on a GPU."""
         return Captured(self.noisy_suggestion, self.device)
 
     def noisy_suggestion(self, obs: Tensor, noise: Tensor) -> Tensor:
@@ -232,7 +232,7 @@ class SAC(Agent):
         return {"temperature": temperature, "entropy": self.entropy[:, 0], **self.last_losses}
 
     def draw_noise(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Noise for the samples at s and at s': with gSDE one theta serves both, for the whole batch."""
+        """Draw the noise of the samples at s and at s'. With gSDE, one theta serves both for the whole batch."""
         if self.config.gsde:
             theta = self.update_noise.normal(*self.actor.noise_shape)
             return theta, theta
@@ -241,7 +241,7 @@ class SAC(Agent):
 
 
 class Temperature(nn.Module):
-    """The entropy coefficient alpha of every seed, learned in its logarithm, starting at 1."""
+    """The entropy coefficient alpha of every seed, learned as log_alpha (seeds, 1). It starts at alpha = 1."""
 
     def __init__(self, seeds: int):
         super().__init__()

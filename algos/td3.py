@@ -1,8 +1,8 @@
 """TD3 under action constraints: DPro, DPre, DOpt, DAlpha, DRad, DGauge, DFlow and their + variants.
 
 Fujimoto et al. (2018) with a feasibility map P_s between the actor mu and the critics (paper, Sections "Algorithms
-Based on the Closest Point Projection" and "Other Mapping Techniques"). The names differ only in which map, where it
-stands (`core.agent.Agent`) and whether the penalty for infeasible suggestions joins the actor's loss.
+Based on the Closest Point Projection" and "Other Mapping Techniques"). The names differ only in the map, its placement
+(`core.agent.Agent`) and whether the actor's loss includes the penalty for infeasible suggestions.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from core.networks import MLP, Adam, TwinCritic, frozen_copy, rows_of, soft_upda
 from core.replay import Batch
 
 MEASURES = ("critic_loss", "actor_loss", "mean_q")
-"""Columns of training.csv. The critics' loss and value are means over both and over the batch, the value at the actions
-of the batch."""
+"""Columns of training.csv. The critics' loss and value are means over both critics and the batch. The value is taken at
+the actions of the batch."""
 
 
 @dataclass
@@ -68,7 +68,7 @@ class TD3(Agent):
         self.actor_target, self.critic_target = frozen_copy(self.actor), frozen_copy(self.critic)
         self.actor_optimizer = Adam(self.actor.parameters(), learning_rate)
         self.critic_optimizer = Adam(self.critic.parameters(), learning_rate)
-        # Measures of the last step of each kind, a row a seed.
+        # Measures of the last step of each kind, one value per seed.
         self.measures = {name: torch.zeros(len(self.seeds), device=self.device) for name in MEASURES}
 
     def networks(self) -> dict[str, nn.Module]:
@@ -101,7 +101,7 @@ class TD3(Agent):
 
     @cached_property
     def explored(self) -> Captured:
-        """`noisy_suggestion`, a CUDA graph on a GPU."""
+        """`noisy_suggestion`, as a CUDA graph on a GPU."""
         return Captured(self.noisy_suggestion, self.device)
 
     def noisy_suggestion(self, obs: Tensor, noise: Tensor) -> Tensor:
@@ -141,7 +141,7 @@ class TD3(Agent):
         return batch.reward + self.config.gamma * (1 - batch.terminated) * next_q
 
     def target_action(self, batch: Batch) -> Tensor:
-        """The target actor's action, as the critic would see it, with clipped noise; then back into bounds."""
+        """The target actor's action, as the critic sees it, with clipped noise, put back by `Map.limit_target`."""
         action = self.suggest(self.actor_target, batch.next_obs)
         if self.placement != "environment":
             action = self.feasible(batch.next_obs, action, batch.next_center)

@@ -1,4 +1,4 @@
-"""What the algorithm files share: acting through the feasibility map, warm-up actions, and steps of optimisers."""
+"""The base class of the algorithms: acting through the feasibility map, warm-up actions and steps of optimisers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from core.replay import Batch
 from core.snapshot import Snapshots, parameters_of
 
 MAP = "map"
-"""In the names of saved parameters, the map."""
+"""The prefix of the map's parameters in the names of saved parameters."""
 
 
 class Action(NamedTuple):
@@ -36,47 +36,47 @@ class Agent(Snapshots):
     the map stands (paper, Section "Algorithms for Action-Constrained RL"):
 
     - `environment`: inside the environment; critic and replay buffer see the suggested action;
-    - `rollout`: between actor and environment; critic and buffer see the executed action, but the actor's loss is
-      blind to the map;
-    - `layer`: the last layer of the actor; critic and buffer see the executed action, gradients pass the map.
+    - `rollout`: between actor and environment; critic and buffer see the executed action, but the actor's loss ignores
+      the map;
+    - `layer`: the last layer of the actor; critic and buffer see the executed action, gradients pass through the map.
 
     An algorithm declares its settings, its rows of the paper's table and what it supports in class attributes, and
     implements the abstract methods. It is off-policy: it learns from batches of a replay buffer.
 
-    Its contracts, which `algos.check_algorithm` tries out:
+    It must keep these contracts, which `algos.check_algorithm` checks:
 
     - Random numbers come from `init` in `build`, from `exploration` (with `which=which`) in acting and from
       `update_noise` in gradient steps, and from nowhere else: the same command gives the same bits.
-    - A learned parameter has k rows a seed (`networks`). Row i starts from numbers of init[i]. Modules are in
-      `networks`, optimisers in `optimizers`. A module that no optimiser trains takes no gradient.
-    - No seed depends on its neighbours: a loss is the mean over the batch and never over seeds, and `explore`,
-      `start_episode` and `start_rollout` change the rows `which` alone.
-    - What the future depends on beside these is in `memory`, so that a resumed training repeats every bit.
+    - A learned parameter has k rows per seed (see `networks`). The rows of seed i are initialised from init[i].
+      `networks` returns all modules, `optimizers` all optimisers. A parameter that no optimiser trains is frozen.
+    - No seed depends on other seeds: a loss is the mean over the batch and never over seeds, and `explore`,
+      `start_episode` and `start_rollout` change only the rows `which`.
+    - `memory` returns all other tensors that later steps depend on, so that a resumed training repeats every bit.
     - Every loss goes through `descend`, so that a divergence ends its seed.
-    - Executed actions, those of `policy` too, come from the map (`feasible`). `policy` is deterministic, and keeps a
+    - Executed actions, also those of `policy`, come from the map (`feasible`). `policy` is deterministic, and keeps a
       copy of its parameters.
-    - `statistics` has the same names in every call, a value a seed.
-    - Where gradient steps differ, `update` counts them in `updates`, and `cycle` is their period.
+    - `statistics` returns the same names in every call, with one value per seed.
+    - If gradient steps differ, `update` counts them in `updates`, and `cycle` is their period.
     """
 
     config_class: ClassVar[type[Config]] = Config
     """The dataclass of its settings."""
     family: ClassVar[str]
-    """The algorithm that it derives from, which names its columns of the table of hyperparameters."""
+    """The base algorithm, such as TD3. It names the columns in the table of hyperparameters."""
     paper: ClassVar[dict[str, dict[str, Any]]]
-    """Settings of the paper's table by group of robots. "Others" serves robots without a group of their own."""
+    """Settings of the paper's table by group of robots. "Others" is for robots without their own group."""
     maps: ClassVar[tuple[type[Map], ...]] = (Map,)
-    """The kinds of maps that it can have."""
+    """The classes of maps that it supports."""
     placements: ClassVar[tuple[Placement, ...]] = get_args(Placement)
-    """Where its map can stand."""
+    """The placements of its map that it supports."""
     needs_log_prob: ClassVar[bool] = False
     """Whether it needs the log-density of the action that the critic sees."""
     takes_penalty: ClassVar[bool] = False
-    """Whether its actor loss can have the term `penalty`, as in the names with +."""
+    """Whether its actor loss supports the term `penalty` of the names with +."""
 
     @classmethod
     def check_combination(cls, map: Map, placement: Placement, penalty: bool) -> None:
-        """Raise ValueError, with the reason, where the algorithm is not implemented for this row of the table."""
+        """Raise ValueError, with the reason, if the algorithm is not implemented for this combination."""
         name, map_name = cls.__name__, type(map).__name__
         missing = [*sorted(cls.__abstractmethods__), *(a for a in ("family", "paper") if not hasattr(cls, a))]
         if missing:
@@ -117,7 +117,7 @@ class Agent(Snapshots):
         self.placement = placement
         self.stores_centers = self.map.replays_center(constraint)
         self.penalty_weight = config.penalty if isinstance(config, PenaltyConfig) else None
-        # Of networks, batches and what `explore` and `policy` are given. Who trains a cell has chosen (`sweep.train`).
+        # The device of networks, batches and the inputs of `explore` and `policy`. `sweep.train` has resolved auto.
         self.device = torch.device("cpu" if config.device == AUTO else config.device)
         self.exploration = Streams(seeds, "explore", self.device)
         self.update_noise = Streams(seeds, "update", self.device)
@@ -125,7 +125,7 @@ class Agent(Snapshots):
         self.losses: dict[str, Tensor] = {}  # (..., seeds) of the last step of each optimiser
         self.build(Streams(seeds, "init").generators)
 
-    # ---------------------------------------------------------------- what an algorithm gives, beside `Snapshots`
+    # ---------------------------------------------------------------- what an algorithm implements, besides `Snapshots`
 
     @abstractmethod
     def build(self, init: Sequence[torch.Generator]) -> None:
@@ -135,43 +135,43 @@ class Agent(Snapshots):
     def explore(self, obs: Tensor, which: Sequence[int]) -> Tensor:
         """Suggestions (seeds, d) with exploration noise, for obs (seeds, n). Only the rows `which` count.
 
-        Where the map squashes, `act` puts them back into the box.
+        If the map squashes, `act` clamps the suggestions to the box.
         """
 
     @abstractmethod
     def policy(self, which: Sequence[int]) -> Callable[[Tensor], Tensor]:
-        """The present deterministic policy of the seeds `which`: obs (len(which), m, n) -> executed actions."""
+        """The current deterministic policy of the seeds `which`: obs (len(which), m, n) -> executed actions."""
 
     @abstractmethod
     def update(self, batch: Batch) -> None:
         """One gradient step of every seed."""
 
     def start_rollout(self, which: Sequence[int]) -> None:  # noqa: B027 - most algorithms have nothing to do
-        """Called for the seeds `which` before the first step of each of their rollouts, in warm-up too."""
+        """Called before the first step of each rollout of the seeds `which`, also in warm-up."""
 
     def start_episode(self, which: Sequence[int]) -> None:  # noqa: B027 - most algorithms have nothing to do
-        """Called for the seeds `which` before the first step of each of their training episodes, in warm-up too.
+        """Called before the first step of each training episode of the seeds `which`, also in warm-up.
 
-        It is for what an episode starts with, as the noise of an Ornstein-Uhlenbeck process. Draw from
-        `self.exploration` with `which=which`, write to the rows `which` alone, and give the tensor to `memory()`: a
-        resumed training goes on within the episode, without another call. Where a rollout starts too, `start_rollout`
-        follows. Episodes of evaluations have no call.
+        Initialise here what lasts for an episode, such as the noise of an Ornstein-Uhlenbeck process. Draw from
+        `self.exploration` with `which=which`, write only to the rows `which`, and return the tensor in `memory()`: a
+        training that resumes within an episode does not call this again. If a rollout starts at the same step,
+        `start_rollout` is called afterwards. Evaluation episodes do not call this.
         """
 
     def statistics(self) -> dict[str, Tensor]:
         """Measures of the last gradient steps, for training.csv: name -> (seeds,), the same names in every call.
 
-        Called beside an evaluation, after the first gradient step. A training that resumes may ask before its next
-        gradient step, so keep the numbers in `memory()` or compute them from it.
+        Called at each evaluation after the first gradient step. A resumed training may call it before its next gradient
+        step, so keep the numbers in `memory()` or compute them from it.
         """
         return {}
 
     @property
     def cycle(self) -> int:
-        """The number of gradient steps after which the same kind of step comes again.
+        """The number of gradient steps after which the kinds of steps repeat.
 
         On a GPU, one CUDA graph is captured for each residue of `self.updates` modulo `cycle`. An algorithm whose steps
-        differ, as TD3's with and without the actor, counts `self.updates` in `update` and overrides this.
+        differ, such as TD3's with and without the actor, overrides this and counts `self.updates` in `update`.
         """
         return 1
 
@@ -179,9 +179,9 @@ class Agent(Snapshots):
 
     @torch.no_grad()
     def act(self, obs: Tensor, center: Tensor | None, warming_up: Sequence[int], exploring: Sequence[int]) -> Action:
-        """Actions of the seeds `warming_up`, random ones, and of those `exploring`, the actor's with noise.
+        """Random actions for the seeds `warming_up`, the actor's actions with noise for the seeds `exploring`.
 
-        obs (seeds, n) and `center` (seeds, d), from `centers`, are on the CPU. Ignore the other rows of the actions.
+        obs (seeds, n) and `center` (seeds, d), from `centers`, are on the CPU. Ignore the other rows of the result.
         """
         if len(exploring) == len(self.seeds):
             raw = self.explore(obs.to(self.device), exploring).cpu()
@@ -206,23 +206,23 @@ class Agent(Snapshots):
 
     @torch.no_grad()
     def centers(self, obs: Tensor) -> Tensor | None:
-        """The centres (..., d) of the sets at obs (..., n), None where the map needs none but the origin."""
+        """The centres (..., d) of the sets at obs (..., n); None if the map uses no centre or only the origin."""
         return self.constraint.center(obs) if self.stores_centers else None
 
     def feasible(self, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
-        """The feasible action that the algorithm's map makes of a suggestion."""
+        """Map suggestions (..., d) to feasible actions (..., d) with the algorithm's map."""
         return self.map(self.constraint, obs, suggested, center)
 
     def squash(self, raw: Tensor) -> Tensor:
-        """The suggestion in the output of an actor's network."""
+        """The suggestion that the output `raw` of an actor's network stands for: its tanh if the map squashes."""
         return raw.tanh() if self.map.squashes else raw
 
     def bounded(self, raw: Tensor) -> Tensor:
-        """What the map is given of the suggestions `raw`: the box's closest point where the map squashes."""
+        """The map's input for the suggestions `raw`: clamped to the box if the map squashes."""
         return raw.clamp(-1.0, 1.0) if self.map.squashes else raw
 
     def proposed(self, obs: Tensor, raw: Tensor) -> Tensor:
-        """The actions of which training.csv tells how far outside the set they are, for the suggestions `raw`."""
+        """The actions, for the suggestions `raw`, whose violation training.csv logs."""
         return self.map.propose(self.constraint, obs, self.bounded(raw))
 
     def warm_up(self, which: Sequence[int]) -> Tensor:
@@ -232,7 +232,7 @@ class Agent(Snapshots):
     # ---------------------------------------------------------------- learning
 
     def penalty(self, obs: Tensor, suggested: Tensor) -> Tensor | float:
-        """The term that names with + add to the actor loss (seeds, batch), zero for other names (paper, "Algorithms").
+        """The term (seeds, batch) of the actor loss in names with +, 0 in other names (paper, "Algorithms").
 
         An algorithm that uses it sets `takes_penalty`.
         """
@@ -240,10 +240,10 @@ class Agent(Snapshots):
         return 0.0 if weight is None else weight * self.constraint.penalty(obs, suggested)
 
     def descend(self, name: str, losses: Tensor) -> None:
-        """One step of the optimiser `name` on the sum of `losses` (..., seeds), which `diverged` looks at.
+        """Take one step of the optimiser `name` on the sum of `losses` (..., seeds), which `diverged` checks.
 
-        Gradients are for the optimiser's own parameters alone. Raises ValueError for an unknown name, and for losses
-        whose last axis is not that of the seeds: their gradients would depend on the number of seeds.
+        Only the optimiser's own parameters get gradients. Raises ValueError for an unknown name, and for losses whose
+        last axis is not the seeds: their gradients would depend on the number of seeds.
         """
         optimizers = self.optimizers()
         if name not in optimizers:
@@ -260,7 +260,7 @@ class Agent(Snapshots):
         optimizer.step()
 
     def diverged(self) -> dict[int, str]:
-        """The positions of the seeds with a loss that is not finite, and which. It waits for the device."""
+        """Maps the position of each seed with a loss that is not finite to the loss's name. Waits for the device."""
         found: dict[int, str] = {}
         sums = [losses.sum() for losses in self.losses.values()]
         if not sums or math.isfinite(torch.stack(sums).sum().item()):  # the common case waits once

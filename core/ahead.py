@@ -1,7 +1,7 @@
-"""Random numbers of gradient steps to come: drawn many steps at a time, brought to the device in one copy.
+"""Random numbers of future gradient steps, drawn for many steps at a time and copied to the device together.
 
-A step that is captured in a CUDA graph finds its numbers on the device by itself: it counts its steps there. The
-numbers are those that the streams would have drawn step by step.
+A step that is captured in a CUDA graph finds its numbers by a counter on the device. The numbers are the same as if the
+streams had drawn them step by step.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ BLOCK = 64
 
 
 class Draw(NamedTuple):
-    """What a stream draws at once: the kind of numbers, and the shape of a seed's share."""
+    """One draw of a stream: the kind of its numbers, and their shape for one seed."""
 
     kind: Literal["normal", "uniform", "words"]
     shape: tuple[int, ...]
@@ -30,9 +30,9 @@ class Draw(NamedTuple):
 
     @property
     def joins(self) -> bool:
-        """Whether one draw of the numbers of many steps gives the numbers of a draw for each step.
+        """Whether one draw for many steps gives the same numbers as one draw for each step.
 
-        PyTorch makes normal numbers in groups of 16 and begins a new group with each draw.
+        PyTorch generates normal numbers in groups of 16 and begins a new group with each draw.
         """
         return self.kind != "normal" or self.size % 16 == 0
 
@@ -48,7 +48,7 @@ class Draw(NamedTuple):
             out.copy_((torch.stack((pairs >> 32, pairs), -1) & 0xFFFFFFFF).view(out.shape))
 
     def skip(self, generator: torch.Generator) -> None:
-        """Leave `generator` as the draw of one step does."""
+        """Advance `generator` as the draw of one step does."""
         if self.kind == "words":
             torch.randint(2, self.shape, generator=generator)  # one word for each number
         else:
@@ -62,9 +62,9 @@ class _Block(NamedTuple):
 
 
 class Ahead:
-    """The numbers of the coming steps of one purpose. While a block is used up, a thread draws the next one.
+    """The random numbers of one purpose for future steps. While one block is in use, a thread draws the next one.
 
-    `kinds` has the draws of each kind of step in their order; the kinds take turns.
+    `kinds` lists the draws of each kind of step in order. The kinds of steps follow each other in a cycle.
     """
 
     def __init__(self, generators: Sequence[torch.Generator], kinds: Sequence[Sequence[Draw]], device: torch.device):
@@ -75,7 +75,7 @@ class Ahead:
         self.words = words == {True}
         width = max(sum(draw.size for draw in draws) for draws in kinds)
         self.block = torch.zeros(len(generators), BLOCK, width, dtype=self._dtype, device=device)
-        self.row = torch.zeros(1, dtype=torch.int64, device=device)  # of the block, that the next step reads
+        self.row = torch.zeros(1, dtype=torch.int64, device=device)  # the row of the block that the next step reads
         self.step: Tensor | None = None  # (seeds, width): the numbers of the step that is computed or captured
         self.position, self.offset = 0, 0  # of its next draw
         self.worker = ThreadPoolExecutor(1)
@@ -90,7 +90,7 @@ class Ahead:
     # ---------------------------------------------------------------- before each step
 
     def begin(self, kind: int) -> None:
-        """Have the numbers of the next step on the device; `kind` is its kind."""
+        """Make sure that the numbers of the next step are on the device. `kind` is the step's kind."""
         if self.taken == self.drawn:
             coming = self.coming or self._draw_later(kind)
             self.first, self.start, numbers = coming.result()
@@ -105,13 +105,13 @@ class Ahead:
     # ---------------------------------------------------------------- within a step, on the device
 
     def read(self, kind: int) -> None:
-        """Read the numbers of the next step, of which `take` returns each draw."""
+        """Read the numbers of the next step. `take` then returns them draw by draw."""
         self.step = self.block.index_select(1, self.row)[:, 0]
         self.row += 1
         self.draws, self.position, self.offset = self.kinds[kind], 0, 0
 
     def take(self, draw: Draw) -> Tensor:
-        """The numbers (seeds, *shape) of the step's next draw."""
+        """The numbers (seeds, *shape) of the step's next draw. Raises RuntimeError if that is not `draw`."""
         if self.step is None or self.position == len(self.draws) or self.draws[self.position] != draw:
             raise RuntimeError(f"a gradient step draws {draw}, which the step before it did not")
         numbers = self.step[:, self.offset : self.offset + draw.size].reshape(-1, *draw.shape)
@@ -121,7 +121,7 @@ class Ahead:
     # ---------------------------------------------------------------- the streams
 
     def state(self, i: int) -> Tensor:
-        """The state of generator i as if every step had drawn its numbers itself."""
+        """The state that generator i would have if every step had drawn its own numbers."""
         generator = torch.Generator()
         generator.set_state(self.start[i])
         for step in range(self.taken):
@@ -130,7 +130,7 @@ class Ahead:
         return generator.get_state()
 
     def rewind(self) -> None:
-        """Forget the numbers that no step has taken, and put the generators back to before them."""
+        """Discard the numbers that no step has taken, and put the generators back to the state before them."""
         states = [self.state(i) for i in range(len(self.generators))]
         if self.coming:
             self.coming.result()
@@ -139,7 +139,7 @@ class Ahead:
         self.start, self.coming, self.taken, self.drawn = states, None, 0, 0
 
     def _draw_later(self, first: int) -> Future[_Block]:
-        # Memory that a copy to the GPU need not wait for. PyTorch gives it to a later block only after that copy.
+        # In pinned memory, the CPU need not wait for the copy to the GPU. PyTorch reuses it only after that copy.
         numbers = torch.empty(self.block.shape, dtype=self._dtype, pin_memory=self.pinned)
         return self.worker.submit(self._draw, first, numbers)
 

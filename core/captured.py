@@ -12,11 +12,11 @@ EAGER_CALLS = 3
 
 
 class Captured:
-    """`function`, called as it is on a CPU, and on a GPU, after its first calls, repeated as a graph without gradients.
+    """Calls `function`. On a GPU, after the first calls, it replays the function as a CUDA graph without gradients.
 
-    The inputs of all calls are on `device` and have the same shapes. The function makes one tensor of them and of
-    memory that keeps its place, such as the parameters of networks. It draws no random numbers, and what it reads from
-    Python is fixed when the graph is made. A call overwrites what the last one returned.
+    The inputs of all calls must be on `device` and have the same shapes. The function computes one tensor from them and
+    from memory at fixed addresses, such as the parameters of networks. It must not draw random numbers. Python values
+    that it reads are fixed when the graph is captured. A replay overwrites the previous result.
     """
 
     def __init__(self, function: Callable[..., Tensor], device: torch.device):

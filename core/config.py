@@ -1,6 +1,6 @@
-"""Settings: the dataclass of those that every algorithm has, how a field is declared, and the parsing of values.
+"""Settings: the dataclass that all algorithms share, the declaration of its fields, and the parsing of values.
 
-An algorithm adds its own settings in a subclass of `Config` beside it, and a map in its own fields (`core.maps.Map`).
+An algorithm declares its own settings in a subclass of `Config`, and a map in its own fields (`core.maps.Map`).
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from core.words import ConfigError
 from store.loggers import CSV, LOGGERS
 
 CORES = torch.get_num_threads()
-"""All physical cores, or OMP_NUM_THREADS."""
+"""PyTorch's default number of threads: the physical cores, or OMP_NUM_THREADS."""
 THREADS = {"cpu": min(CORES, 4), "cuda": min(CORES, 8)}
-"""What threads=auto is for a cell that is alone on the machine. Its networks are small and fill no more than 4; beside
-a GPU the threads move MuJoCo's robots."""
+"""The value of threads=auto, by device, for a cell that is alone on the machine. Its small networks use at most 4
+threads. Beside a GPU, the threads simulate MuJoCo's robots."""
 MOST_THREADS = 1024
 AUTO = "auto"
 """Stands for the fastest choice on the machine that trains."""
 
 
 QUICK_EPISODES = (1, 2)
-"""Episodes of an evaluation, and of the final result, with quick=true. What is learned is the same."""
+"""Episodes of an evaluation and of the final result with quick=true, which does not change the training."""
 
 
 # ---------------------------------------------------------------- how a setting is declared
@@ -55,11 +55,11 @@ def one_of(*choices: str) -> Rule:
 
 
 def setting(default: Any, help: str, rule: Rule | None = None, **metadata: Any) -> Any:
-    """A field of a dataclass that is a key of the command line.
+    """Declare a dataclass field that is a key of the command line.
 
-    `help` is one line for the usage text. Metadata: `key` is its name on the command line and in config.yaml, where
-    that is not the field's; `of_density` marks a map's setting that only algorithms with a log-density have;
-    `only_with` is a pair of another field and its value without which the setting means nothing.
+    `help` is one line for the usage text. Metadata: `key` is the name on the command line and in config.yaml, if it
+    differs from the field's; `of_density` marks a map's setting that only algorithms with a log-density have;
+    `only_with` is a pair (field, value): the setting applies only if that field has that value.
     """
     metadata |= {"help": help, "rule": rule}
     if isinstance(default, list):
@@ -108,7 +108,7 @@ class Config:
     eval_episodes: int = setting(5, "episodes of an evaluation", AT_LEAST_ONE)
     final_episodes: int = setting(50, "episodes of the final result", AT_LEAST_ONE)
     quick: bool = setting(False, "few evaluation episodes, to try something out; part of the run's name")
-    # The run itself; none of these changes what is learned, beyond float rounding.
+    # The run itself. None of these settings changes the training beyond float rounding.
     results: str = setting("results", "folder that results go to")
     overwrite: str = setting(
         "false",
@@ -146,17 +146,17 @@ class Config:
 
 @dataclass
 class PenaltyConfig(Config):
-    """The setting of the names with +."""
+    """The settings of an algorithm whose name ends in +, with the weight of the penalty."""
 
     penalty: float = setting(1.0, "names with +: weight of the penalty", NOT_NEGATIVE)
 
 
 RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "simulator", "device", "threads", "checkpoint_every", "log")
-"""Settings that do not make a run another experiment: they never show in a run's name."""
+"""Settings that do not make a run a different experiment. They never appear in its name."""
 
 
 def keys_that_apply(config: Config) -> list[str]:
-    """The keys that a user can set for the cell of `config`. Where there is no choice, the value is None."""
+    """The keys that a user can set for the cell of `config`, without those that have no choice (value None)."""
     return [key for key, f in keys_of(config).items() if getattr(config, f.name) is not None]
 
 
@@ -164,7 +164,7 @@ def keys_that_apply(config: Config) -> list[str]:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """Seeds of `3`, `0-9`, `1,4,7` or a mixture, ascending and without repetition."""
+    """Parse `3`, `0-9`, `1,4,7` or a mixture into ascending seeds without repetition. Raises ConfigError."""
     seeds: set[int] = set()
     for part in text.split(","):
         first, dash, last = part.partition("-")
@@ -180,10 +180,10 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 
 def split_values(schema: type, key: str, text: str) -> list[str]:
-    """The values of one key of the dataclass `schema` in a comma list: `1e-3,3e-4`, or `[64,64],[128,128]` of lists.
+    """Split a comma list of values of one key of the dataclass `schema`: `1e-3,3e-4`, or `[64,64],[128,128]` for lists.
 
-    A list without brackets is one value, and so is any value of `RUN_KEYS`. Raises ConfigError for an empty value, and
-    for brackets that do not hold all of the values.
+    A list without brackets is one value. Keys in `RUN_KEYS` have one value. Repeated values are dropped. Raises
+    ConfigError for an empty value and for malformed brackets.
     """
     kind = typing.get_type_hints(schema)[keys_of(schema)[key].name]
     if key in RUN_KEYS:
@@ -202,9 +202,9 @@ def split_values(schema: type, key: str, text: str) -> list[str]:
 
 
 def parse_value(schema: type, key: str, text: str, prefix: str = "") -> Any:
-    """The value of one key of the dataclass `schema`; ConfigError where `text` is not of its type.
+    """Parse the value of one key of the dataclass `schema`. Raises ConfigError if `text` does not fit the key's type.
 
-    `prefix` stands before the key on the command line.
+    The message shows the key as on the command line, with `prefix` before it.
     """
     if text in ("null", "None", "~"):
         raise ConfigError(f"bad value {text!r} for {prefix}{key}: a value is needed")
@@ -216,7 +216,7 @@ def parse_value(schema: type, key: str, text: str, prefix: str = "") -> Any:
     if typing.get_origin(kind) is tuple:
         return typed
     try:
-        # OmegaConf would put something else in the place of ${...} and ???.
+        # OmegaConf would substitute ${...} and treat ??? as missing.
         if "${" not in text and "???" not in text:
             checked = OmegaConf.structured(make_dataclass("Checked", [("value", kind)]))
             OmegaConf.update(checked, "value", typed)
@@ -228,7 +228,7 @@ def parse_value(schema: type, key: str, text: str, prefix: str = "") -> Any:
 
 
 def _typed(kind: Any, text: str) -> object:
-    """The text of one override, made ready for the type check of a field of the type `kind`."""
+    """Prepare the text of one override for the type check of a field of the type `kind`."""
     if typing.get_origin(kind) is tuple:
         return parse_seeds(text)
     if typing.get_origin(kind) is list:
@@ -237,7 +237,7 @@ def _typed(kind: Any, text: str) -> object:
 
 
 def _whole(text: str) -> int | str:
-    """3e5 is a whole number to a person. The type check refuses a text that is none."""
+    """Convert a whole number, such as 3 or 3e5, to an int. Other text stays text, for the type check to judge."""
     try:
         number = float(text)
     except ValueError:
@@ -246,7 +246,7 @@ def _whole(text: str) -> int | str:
 
 
 def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
-    """`base` with the overrides, type-checked by OmegaConf and range-checked; ConfigError for what does not fit."""
+    """Return `base` with the overrides, checked for type and range. Raises ConfigError for a bad key or value."""
     config = typing.cast(Config, OmegaConf.to_object(OmegaConf.structured(base)))
     config.seeds = tuple(config.seeds)  # OmegaConf makes a list of it
     if parse_value(type(base), "quick", overrides.get("quick", "false")):
@@ -263,7 +263,7 @@ def resolve(base: Config, overrides: Mapping[str, str]) -> Config:
 
 
 def _check_company(config: Config, overrides: Iterable[str]) -> None:
-    """ConfigError for a setting that means nothing beside the value of another one."""
+    """Raise ConfigError for an override whose condition `only_with` does not hold."""
     for key, f in keys_of(config).items():
         if key in overrides and (needed := f.metadata.get("only_with")):
             other, value = needed
@@ -272,7 +272,7 @@ def _check_company(config: Config, overrides: Iterable[str]) -> None:
 
 
 def _check_ranges(config: Config) -> None:
-    """ConfigError for a number that is not finite or a value that breaks the rule of its field."""
+    """Raise ConfigError for a number that is not finite or a value that breaks the rule of its field."""
     for key, f in keys_of(config).items():
         value, rule = getattr(config, f.name), f.metadata.get("rule")
         if isinstance(value, float) and not math.isfinite(value):
@@ -285,25 +285,25 @@ def _check_ranges(config: Config) -> None:
 
 
 def differences(config: Config, base: Config) -> dict[str, object]:
-    """The settings of `config` that make it another experiment than `base`, by key. Seeds do not."""
+    """The settings of `config`, by key, that differ from `base`, without the keys in `RUN_KEYS`."""
     both = {key: (getattr(config, f.name), getattr(base, f.name)) for key, f in keys_of(config).items()}
     return {key: value for key, (value, paper) in both.items() if key not in RUN_KEYS and value != paper}
 
 
 def saved_settings(config: Config, seed: int) -> dict[str, object]:
-    """The configuration of one seed as its run folder keeps it, by key."""
+    """The configuration of one seed, by key, as its run folder stores it."""
     settings = {key: getattr(config, f.name) for key, f in keys_of(config).items()}
     settings |= {"seed": str(seed), "train_freq": str(config.train_freq)}
-    # Runs without `quick` are as those that are older than that setting.
+    # Without quick=true the key is left out, as in runs that are older than this setting.
     left_out = {"results", "overwrite", *(() if config.quick else ("quick",))}
     return {key: value for key, value in settings.items() if key not in left_out}
 
 
 def restore_settings(schema: type[Config], saved: Mapping[str, Any]) -> Config:
-    """The configuration that `saved_settings` has described, of the dataclass `schema`.
+    """Undo `saved_settings`: build a configuration of the dataclass `schema`.
 
-    Keys that the schema does not have, and those without a value, are ignored. Raises TypeError where algorithm or
-    task is missing, and ConfigError for a bad seed.
+    Ignores keys that the schema lacks and keys without a value. Raises TypeError if the algorithm or the task is
+    missing, and ConfigError for a bad seed.
     """
     values = {f.name: saved[key] for key, f in keys_of(schema).items() if saved.get(key) is not None}
     if "seeds" in values:

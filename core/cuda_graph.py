@@ -1,7 +1,7 @@
 """Gradient steps as CUDA graphs: the hundreds of kernels of a step are launched at once, without Python in between.
 
-A graph repeats its operations on the same memory. Only the random numbers differ from step to step. They are drawn on
-the CPU, from each seed's own streams, as without a GPU, many steps at a time (`core.ahead`).
+A graph repeats its operations on the same memory. Only the random numbers differ from step to step. As without a GPU,
+they are drawn on the CPU from each seed's own streams, but for many steps at a time (`core.ahead`).
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from core.ahead import Ahead, Draw
 from core.replay import Replay
 
 EAGER_STEPS = 3
-"""Steps of each kind before one is captured: libraries allocate memory when they are first called."""
+"""Steps of each kind that run before one is captured: libraries allocate memory when they are first called."""
 
 
 class CapturedStep:
-    """A gradient step of `agent`, captured but not taken, that can be repeated."""
+    """A gradient step of `agent` as a CUDA graph. Capturing it does not take the step; each `repeat` does."""
 
     def __init__(self, agent: Agent, step: Callable[[], None]):
         self.agent = agent
@@ -38,10 +38,10 @@ class CapturedStep:
 
 
 class GradientSteps:
-    """Calling it takes one gradient step of every seed of `agent`, on a batch from `replay`.
+    """Each call takes one gradient step of every seed of `agent`, on a batch from `replay`.
 
-    On a GPU it takes the first steps of each of the agent's kinds operation by operation and repeats later ones as
-    graphs. No call waits for the GPU. Sets that are solved on the CPU cannot be part of a graph.
+    On a GPU, the first steps of each kind (see `Agent.cycle`) run eagerly and later ones as graphs. No call waits for
+    the GPU. Sets that are solved on the CPU cannot be part of a graph: with them, every step runs eagerly.
     """
 
     def __init__(self, agent: Agent, replay: Replay, batch_size: int):
@@ -78,7 +78,7 @@ class GradientSteps:
         self.agent.update(self.replay.sample(self.batch_size))
 
     def _step_aside(self, kind: int) -> None:
-        """An eager step on a stream of its own, as capturing demands. Its draws are noted."""
+        """Take an eager step on a separate CUDA stream, as capturing demands, and record its draws."""
         for streams in self.streams:
             streams.recorded = []
         stream = torch.cuda.Stream(self.agent.device)

@@ -1,4 +1,4 @@
-"""Deterministic evaluation episodes in environments of their own, stepped together."""
+"""Evaluation episodes of deterministic policies, in separate environments that step together."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from constraints import ConstraintError
 from core.random import stream_seed
 
 StepTogether = Callable[[Sequence[Any], np.ndarray], Sequence[Any]]
-"""Steps environments, each with its action (d,) of (environments, d). Returns for each what `step` returns or, for an
-action that it refuses, the error that `step` raises."""
+"""Steps each environment with its row of the actions (environments, d). Returns for each environment the result of its
+`step` or, for a refused action, the error that `step` raised."""
 Watch = Callable[[int], AbstractContextManager[Callable[[int], Any]]]
-"""A context around an evaluation of at most so many steps; its function counts steps."""
+"""Takes the largest number of steps of an evaluation. Returns a context around it, which yields a step counter."""
 
 
 def refusal(error: Exception, obs: Any) -> str:
-    """Why an action was refused at the observation (n,), which a ConstraintError does not know."""
+    """Why an action was refused. The observation (n,) is added to a ConstraintError, which does not know it."""
     return f"{error}, at observation {obs.tolist()}" if isinstance(error, ConstraintError) else str(error)
 
 
 class Evaluator:
-    """Owns `parallel` environments a seed, made when first needed; their random streams belong to the seed.
+    """Owns `parallel` environments per seed, made on first use, with random streams of the seed.
 
-    `stop_if_asked` is called before every step and raises to stop. Any exception puts the environments' random streams
-    back, so that the evaluation can be repeated.
+    `stop_if_asked` is called before every step and raises to stop. After any exception, the environments are put back
+    into their states before the evaluation, so that it can be repeated.
     """
 
     def __init__(
@@ -43,15 +43,15 @@ class Evaluator:
     ):
         self.make_env, self.seeds, self.parallel = make_env, seeds, parallel
         self.step_together, self.ask_to_stop = step_together, stop_if_asked
-        self.watch: Watch = lambda steps: nullcontext(lambda count: None)  # the trainer shows a bar
+        self.watch: Watch = lambda steps: nullcontext(lambda count: None)  # the trainer puts a progress bar here
         self.advance: Callable[[int], Any] = lambda count: None
         self.envs: dict[int, list[Any]] = {}
         self.refused: dict[int, str] = {}  # position of a seed -> why its policy's action was refused, in the last run
 
     def run(self, policy: Callable[[Tensor], Tensor], which: Sequence[int], episodes: int) -> np.ndarray:
-        """The returns (len(which), episodes) of `policy`, which maps obs (len(which), m, n) to feasible actions.
+        """The returns (len(which), episodes) of `policy` for the seeds in the positions `which`.
 
-        A return is NaN where the environment refused an action.
+        `policy` maps obs (len(which), m, n) to feasible actions. A return is NaN if an action was refused.
         """
         returns, self.refused = [], {}
         before = {i: [env.unwrapped.get_state() for env in self._envs_of(i)] for i in which}
@@ -68,14 +68,14 @@ class Evaluator:
         return np.concatenate(returns, axis=1)
 
     def stop_if_asked(self) -> None:
-        """Called before every step of the environments."""
+        """Called before every step of the environments. Raises to stop, and otherwise advances the progress bar."""
         self.ask_to_stop()
         self.advance(1)
 
     def _together(self, policy: Callable[[Tensor], Tensor], which: Sequence[int], count: int) -> np.ndarray:
         envs = [env for i in which for env in self._envs_of(i)[:count]]
         obs = np.stack([env.reset()[0] for env in envs]).astype(np.float32)
-        seen = torch.from_numpy(obs).unflatten(0, (len(which), count))  # shares its memory
+        seen = torch.from_numpy(obs).unflatten(0, (len(which), count))  # shares memory with obs
         returns = np.zeros(len(envs))
         running = list(range(len(envs)))
         while running:

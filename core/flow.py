@@ -1,8 +1,8 @@
-"""The map of DFlow and SFlow: a conditional normalising flow takes the box to the feasible set of each state.
+"""The map of DFlow and SFlow: a conditional normalising flow maps the box to the feasible set of each state.
 
 The flow is RealNVP (Dinh et al., 2017) with six affine couplings, as in FlowPG (Brahmanage et al., NeurIPS 2023) and
-CV-Flow (the same, AAAI 2025). `core.flow_training` trains it before the agent, once for all seeds. It is not exact:
-what it makes of a point of the box may lie outside the set, and the map projects that.
+CV-Flow (the same authors, AAAI 2025). `core.flow_training` trains it before the agent, once for all seeds. A trained
+flow is not exact: it takes some points of the box outside the set, and the map projects the result.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from core.networks import Linear
 COUPLINGS = 6
 CPU = torch.device("cpu")
 _LARGEST_FEATURE = 5.0
-"""Standard deviations from the mean at which a feature is cut: the training has seen nothing further out."""
+"""Features are clamped to this many standard deviations from their mean: the flow is not trained further out."""
 
 
 class Coupling(nn.Module):
     """The affine map x -> exp(s) x + t of some coordinates; s and t depend on the other coordinates and the features.
 
-    s is in [-1, 1]. A new one is the identity.
+    s is in [-1, 1]. A new coupling is the identity.
     """
 
     def __init__(self, given: int, moved: int, features: int, width: int, generator: torch.Generator):
@@ -41,7 +41,7 @@ class Coupling(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, given: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        """s and t (batch, moved) at the other coordinates (batch, given) and the features (batch, k)."""
+        """Return s and t (batch, moved) for the other coordinates (batch, given) and the features (batch, k)."""
         x, last = torch.cat((given, features), -1), len(self.layers) - 1
         for number, layer in enumerate(cast("Iterable[Linear]", self.layers)):
             x = torch.addmm(layer.bias[0], x, layer.weight[0])
@@ -52,9 +52,9 @@ class Coupling(nn.Module):
 
 
 class ConditionalFlow(nn.Module):
-    """A bijection of R^d for each state: `decode` takes points x (..., d) to actions a (..., d), `encode` back.
+    """A bijection of R^d for each state: `decode` maps points x (..., d) to actions a (..., d), `encode` maps back.
 
-    Both take the features (..., k) of the states first, whose leading dimensions broadcast, and also return
+    The first argument of both is the features (..., k) of the states. Leading dimensions broadcast. Both also return
     log |det da/dx| (...). Results have the dtype of the parameters.
     """
 
@@ -82,7 +82,7 @@ class ConditionalFlow(nn.Module):
         deviation = (features - self.feature_mean).square().mean(0).sqrt()
         self.feature_scale.copy_(torch.where(deviation > 1e-6, deviation, 1.0))
         self.action_mean.copy_(actions.mean(0))
-        self.action_scale.copy_(actions.std(0) * 3.0**0.5)  # the box itself has the deviation 1 / sqrt(3)
+        self.action_scale.copy_(actions.std(0) * 3.0**0.5)  # uniform in the box, they have the deviation 1 / sqrt(3)
 
     def decode(self, features: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         lead, x, features = self._prepare(features, x)
@@ -114,26 +114,26 @@ class ConditionalFlow(nn.Module):
         return lead, x.reshape(lead.numel(), x.shape[-1]), standard.reshape(lead.numel(), standard.shape[-1])
 
     def _split(self, number: int, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The coordinates that a coupling is given, and those that it moves.
+        """Split x (batch, d) into the coordinates that coupling `number` reads and the coordinates that it moves.
 
-        Two halves take turns. Which coordinates are neighbours in a half changes after each two couplings.
+        The two halves alternate. If d > 2, the coordinates are rolled by one more place after every two couplings.
         """
         x = x.roll(-self.shifts[number], -1)
         first, second = x[:, : self.middle], x[:, self.middle :]
         return (first, second) if number % 2 == 0 else (second, first)
 
     def _join(self, number: int, given: Tensor, moved: Tensor) -> Tensor:
-        """The coordinates (batch, d) in their order."""
+        """Undo `_split`: the coordinates (batch, d) in their original order."""
         return torch.cat((given, moved) if number % 2 == 0 else (moved, given), -1).roll(self.shifts[number], -1)
 
 
 @dataclass
 class Flow(Map):
-    """A trained flow, and the projection of what it leaves outside the set.
+    """A trained flow, followed by a projection for the results outside the set.
 
-    The suggestion is a point of the box, which the flow decodes. The log-density is that of the suggestion or, with
-    `flow_entropy=action`, of the decoded action before the projection. `load_state` gives it a flow that
-    `core.flow_training` has trained; RuntimeError before that.
+    The suggestion is a point of the box, which the flow decodes. The log-density is the suggestion's or, with
+    `flow_entropy=action`, the decoded action's before the projection. `load_state` loads a flow that
+    `core.flow_training` has trained. Before that, a call raises RuntimeError.
     """
 
     flow: str = setting(
@@ -163,7 +163,7 @@ class Flow(Map):
     needs_center = False
 
     def __post_init__(self) -> None:
-        self._networks: dict[torch.device, ConditionalFlow] = {}  # the flow on each device that has asked for it
+        self._networks: dict[torch.device, ConditionalFlow] = {}  # a copy of the flow per device, made on first use
 
     def __call__(self, constraint: Constraint, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
         return constraint.project(obs, self.propose(constraint, obs, suggested))
@@ -182,7 +182,7 @@ class Flow(Map):
         return constraint.project(obs, action)
 
     def new_network(self, dim: int, features: int) -> ConditionalFlow:
-        """An untrained flow for actions (..., dim) and so many features of the state, always the same."""
+        """An untrained flow for actions (..., dim) and `features` features of a state, always with the same weights."""
         return ConditionalFlow(dim, features, self.flow_width, torch.Generator().manual_seed(0))
 
     def use_untrained(self, constraint: Constraint, obs: Tensor) -> None:
@@ -199,7 +199,7 @@ class Flow(Map):
             network.load_state_dict(state)
 
     def _decode(self, constraint: Constraint, obs: Tensor, suggested: Tensor) -> tuple[Tensor, Tensor]:
-        """The actions (..., d) that the flow makes of suggestions, and log |det da/dx| (...)."""
+        """Decode suggestions (..., d) to actions (..., d). Also return log |det da/dx| (...)."""
         action, log_det = self._on(obs.device).decode(constraint.features(obs), suggested)
         return action.to(suggested.dtype), log_det.to(suggested.dtype)
 
@@ -207,7 +207,7 @@ class Flow(Map):
         self._networks = {CPU: network.requires_grad_(False)}
 
     def _on(self, device: torch.device) -> ConditionalFlow:
-        """The flow on a device."""
+        """The flow on `device`. Raises RuntimeError if there is no flow yet."""
         if not self._networks:
             raise RuntimeError("this map has no flow yet: sweep.flows trains one, and load_state takes it")
         if device not in self._networks:

@@ -1,15 +1,15 @@
-"""The training of a flow (`core.flow`), before that of an agent: once for a task and settings, shared by all seeds.
+"""Trains a flow (`core.flow`) once for each task and settings, before any agent. All seeds share it.
 
-With x the point of the box, a the action and s the state:
+Let x be the point of the box, a the action and s the state:
 
 - `mle`, as FlowPG: actions a are uniform in the set, x = encode(a | s), and the loss is log |det da/dx| plus half the
   square of x's distance from the box in units of `mle_softness`: maximum likelihood under a box with soft edges.
 - `reverse`, as CV-Flow: points x are uniform in the box, a = decode(x | s), and the loss is -log |det da/dx| plus how
   far a is outside in units of `reverse_softness`: the Kullback-Leibler divergence to a set with soft edges. "How far
-  outside" is `Constraint.penalty` plus the sum of what exceeds the box. Every other point is moved to the box's faces,
-  where policies often are. Without that, most of the faces end up outside.
+  outside" is `Constraint.penalty` plus the sum of what exceeds the box. Every second point is moved to a face of the
+  box, where policies often are. Otherwise the flow would take most of the faces outside the set.
 
-States are those of random play, moved towards their mean or away from it (`FURTHEST`).
+The states come from random play and are moved towards their mean or away from it (`FURTHEST`).
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from core.networks import Adam
 from core.snapshot import parameters_of
 
 POOL = 100_000
-"""States of a training, each with an action that is uniform in its set for `mle`."""
+"""The number of training states. For `mle`, each has an action that is uniform in its set."""
 HELD_OUT = 4_000
-"""The number of states, of parts of random play that the training does not use, for the measures."""
+"""The number of states for the measures, from parts of random play that the training does not use."""
 FURTHEST = 4.0
-"""Times as far from their mean as in random play, at most: a trained policy moves faster."""
+"""The largest factor on a state's distance from the mean: a trained policy moves faster than a random one."""
 SCALING = 1_000
-"""Actions from which the flow takes its scales."""
+"""The number of actions that set the flow's scales for `reverse`. For `mle`, all actions do."""
 LARGEST_STEP = 0.1
-"""Norm of the gradient at most, as published."""
+"""The norm to which gradients are clipped, as published."""
 TRIES = 64
 _CHUNK = 2_000
 _SLOW_CHUNK = 100
-"""States whose actions `Constraint.sample` draws without a look at the user's wish to stop."""
+"""The number of states for which `Constraint.sample` draws between two calls of `stop_if_asked`."""
 _FEASIBLE = 1e-6
 
 
@@ -48,10 +48,11 @@ class DivergedError(Exception):
 
 
 class FlowTraining:
-    """Trains the flow of `flow`, whose settings say how.
+    """Trains a flow with the settings of the map `flow`.
 
-    `obs` (n, k) are states of random play, the last `HELD_OUT` for measures. The same arguments give the same bits.
-    `stop_if_asked` raises to end the preparation. Raises a ConstraintError where the set breaks down at one of `obs`.
+    `obs` (n, k) are observations of random play, the last `HELD_OUT` for the measures. The same arguments give the same
+    bits. The constructor calls `stop_if_asked`, which raises to stop it. It raises a ConstraintError if the constraint
+    fails at one of `obs`.
     """
 
     def __init__(
@@ -65,16 +66,16 @@ class FlowTraining:
         self.features = torch.cat([constraint.features(chunk).float() for chunk in self.obs.split(_CHUNK)])
         self.actions = self._feasible(self.obs if flow.flow == "mle" else self.obs[:SCALING], stop_if_asked)
         self.test_actions = self._feasible(self.test_obs, stop_if_asked)
-        self.tolerance = constraint.least_violation(self.test_obs) + _FEASIBLE  # of a feasible action
+        self.tolerance = constraint.least_violation(self.test_obs) + _FEASIBLE  # of actions that count as feasible
         self.network = flow.new_network(constraint.dim, self.features.shape[-1])
         self.network.standardize(self.features, self.actions)
         self.optimizer = Adam(self.network.parameters(), flow.flow_learning_rate)
         self.parameters = parameters_of(self.optimizer)
 
     def _further_out(self, obs: Tensor, count: int, stop_if_asked: Callable[[], None]) -> Tensor:
-        """`count` of obs (n, k), moved to 0 to `FURTHEST` times their distance from the mean of all.
+        """Draw `count` of obs (n, k) and move each to 0 to `FURTHEST` times its distance from the mean of all.
 
-        One whose set is empty there stays where it is. If the set breaks down at one of them, all do.
+        An observation does not move if its set would be empty. If the constraint fails at one of them, none moves.
         """
         some = obs[torch.randint(len(obs), (count,), generator=self.generator)]
         mean = obs.mean(0)
@@ -86,17 +87,18 @@ class FlowTraining:
                 self.constraint.project(chunk, chunk.new_zeros(len(chunk), self.constraint.dim))
                 self.constraint.center(chunk)
                 empty.append(self.constraint.least_violation(chunk) > 0.0)
-        except ConstraintError:  # a set of one's own need not exist where the robot cannot be
+        except ConstraintError:  # a user's set need not exist where the robot cannot be
             return some
         finally:
             check_inputs(checked_before)
         return torch.where(torch.cat(empty).unsqueeze(-1), some, moved)
 
     def _feasible(self, obs: Tensor, stop_if_asked: Callable[[], None]) -> Tensor:
-        """An action (n, d) for each of obs (n, k), uniform in its set.
+        """Draw an action (n, d), uniform in its set, for each of obs (n, k).
 
-        It is the first feasible one of `TRIES` in the box, which takes a small part of the time of `Constraint.sample`.
-        Where the set is empty, it is the projection of one, which violates least.
+        It is the first feasible one of `TRIES` draws from the box, which is much faster than `Constraint.sample`; only
+        if there is none, `Constraint.sample` draws it. If the set is empty, it is the projection of a draw, which has
+        the least violation.
         """
         actions = []
         for chunk in obs.split(_CHUNK):
@@ -118,7 +120,7 @@ class FlowTraining:
         return self.step == self.flow.flow_steps
 
     def advance(self) -> None:
-        """One gradient step. Raises DivergedError."""
+        """Take one gradient step. Raises DivergedError if the loss or, at the end, a parameter is not finite."""
         self.optimizer.param_groups[0]["lr"] = self.learning_rate()
         rows = torch.randint(len(self.obs), (self.flow.flow_batch_size,), generator=self.generator)
         loss = (self._likelihood if self.flow.flow == "mle" else self._divergence)(rows).mean()
@@ -135,11 +137,11 @@ class FlowTraining:
             raise DivergedError("a parameter is not finite at the end")
 
     def learning_rate(self) -> float:
-        """That of the next step: a cosine takes it to 0."""
+        """The learning rate of the next step, which falls to 0 along a cosine."""
         return self.flow.flow_learning_rate * 0.5 * (1 + math.cos(math.pi * self.step / self.flow.flow_steps))
 
     def points(self, count: int) -> Tensor:
-        """Points (count, d) of the box for the loss `reverse`: every other one is on a face."""
+        """Draw points (count, d) of the box for the loss `reverse`, every second one on a face."""
         x = 2.0 * torch.rand(count, self.constraint.dim, generator=self.generator) - 1.0
         x[::2] = on_faces(x[::2])
         return x
@@ -158,11 +160,12 @@ class FlowTraining:
 
     @torch.no_grad()
     def measure(self) -> dict[str, float]:
-        """How good the flow is at other states of the same kind, with the same random numbers each time.
+        """Measure the flow at the held-out states, with the same random numbers in every call.
 
-        `accuracy` is the share of uniform points of the box that it decodes to feasible actions, `face_accuracy` that
-        of points of the box's faces, `recall` that of uniform feasible actions that it encodes into the box, and
-        `violation` the mean violation of decoded actions, where a feasible one counts as 0.
+        `accuracy` is the share of uniform points of the box that the flow decodes to feasible actions, `face_accuracy`
+        the same share for points on the box's faces. `recall` is the share of uniform feasible actions that the flow
+        encodes into the box. `violation` is the mean violation of the actions decoded from points of the box; a
+        feasible action counts as 0.
         """
         features = self.constraint.features(self.test_obs)
         x = 2.0 * torch.rand(self.test_actions.shape, generator=torch.Generator().manual_seed(2)) - 1.0
@@ -179,7 +182,7 @@ class FlowTraining:
         }
 
     def state(self) -> dict[str, Any]:
-        """What a training of the same arguments needs to go on with the same bits."""
+        """What a new object with the same arguments needs to continue with the same bits."""
         optimizer = {
             f"{number}.{key}": value.clone()
             for number, parameter in enumerate(self.parameters)
@@ -191,7 +194,7 @@ class FlowTraining:
         }  # fmt: skip
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state` has returned."""
+        """Continue from what `state` returned."""
         self.network.load_state_dict(state["network"])
         for name, value in state["optimizer"].items():
             number, key = name.split(".")
@@ -201,5 +204,5 @@ class FlowTraining:
 
 
 def on_faces(x: Tensor) -> Tensor:
-    """The points (..., d) of the box's faces that are on the rays from the origin through x."""
+    """Move points x (..., d) along their rays from the origin to the faces of the box."""
     return x / x.abs().amax(-1, keepdim=True).clamp(min=1e-9)

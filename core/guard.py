@@ -1,4 +1,4 @@
-"""Observations at which a constraint breaks down, as where its set is empty: each ends its own seed, not the others."""
+"""Isolates constraint failures: an observation with, say, an empty set ends its own seed and no other one."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from constraints.ray import Ray
 from core.evaluation import StepTogether, refusal
 
 Rows = Sequence[int] | None
-"""Which row of a batch stands in the place of each; None where each is itself."""
+"""For each row of a batch, the row that is used in its place; None if each row stands for itself."""
 
 
 class Guard:
-    """Keeps a ConstraintError that names a sample from the seeds that the sample does not belong to.
+    """Confines a ConstraintError that names a sample to the seed of that sample.
 
-    `constraint` is a copy of the given one. A method of it that cannot handle a seed's observations takes another
-    seed's in their place, and `refused` says why: position of the seed -> reason. The results of that seed mean
-    nothing from there on; those of the others are what they are without it. The first axis of the observations must be
-    that of the seeds. Any other error, and one that leaves no seed, is raised.
+    `constraint` is a copy of the given one. If a method of the copy fails on a seed's observations, it uses another
+    seed's observations instead, and `refused` maps the seed's position to the reason. From then on, the results of this
+    seed are meaningless. The results of the other seeds do not change. The first axis of the observations must be the
+    seeds. Any other error, and an error that leaves no seed, is raised.
     """
 
     def __init__(self, constraint: Constraint, seeds: int):
@@ -36,7 +36,7 @@ class Guard:
 
     @contextmanager
     def of(self, which: Sequence[int]) -> Iterator[dict[int, str]]:
-        """In the block, the first axis is that of the seeds `which`. Gives what is refused there, at first nothing."""
+        """In the block, the first axis is the seeds `which`. Yields the seeds refused in the block, at first none."""
         before = self.positions, self.refused
         self.positions, self.refused = which, {}
         try:
@@ -45,13 +45,16 @@ class Guard:
             self.positions, self.refused = before
 
     def apart(self, policy: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-        """`policy`, obs (seeds, m, n) -> actions (seeds, m, d), with NaN for refused seeds: they execute nothing."""
+        """Wrap `policy`, obs (seeds, m, n) -> actions (seeds, m, d), to return NaN for refused seeds.
+
+        Environments refuse to execute NaN.
+        """
 
         def act(obs: Tensor) -> Tensor:
             try:
                 actions = policy(obs)
             except ConstraintError:
-                if any(position not in self.refused for position in self.positions):  # it is about no single seed
+                if any(position not in self.refused for position in self.positions):  # it belongs to no single seed
                     raise
                 return obs.new_full((*obs.shape[:-1], self.constraint.dim), torch.nan)
             refused = [k for k, position in enumerate(self.positions) if position in self.refused]
@@ -70,7 +73,7 @@ class Guard:
                 return method(*args, **kwargs) if rows is None else _call_with(rows, method, args, kwargs)
 
             result, rows = self._attempt(obs, call)
-            if isinstance(result, Ray):  # which asks for its gauge later
+            if isinstance(result, Ray):  # a ray computes its gauge later
                 gauge_of = result._gauge_of
 
                 def gauge(direction: Tensor, now: Rows) -> tuple[Tensor, Tensor]:
@@ -82,7 +85,7 @@ class Guard:
         return guarded
 
     def _attempt(self, obs: Tensor, call: Callable[[Rows], Any]) -> tuple[Any, Rows]:
-        """The result of `call` for the rows that may stand in each place, and these."""
+        """Run `call`, refusing seeds until it succeeds. Return its result and the rows that it used."""
         while True:
             rows = self._rows(obs)
             try:
@@ -91,21 +94,21 @@ class Guard:
                 self._refuse(error, obs, rows)
 
     def _rows(self, obs: Tensor) -> Rows:
-        """The row of `obs` that stands in the place of each: itself, or a sound one where the seed is refused."""
+        """For each row of `obs`, the row to use in its place: itself, or a sound one if its seed is refused."""
         if not self.refused or not self._has_seeds(obs):
             return None
         sound = [k for k, position in enumerate(self.positions) if position not in self.refused]
         return [k if k in sound else sound[0] for k in range(len(self.positions))] if sound else None
 
     def _refuse(self, error: ConstraintError, obs: Tensor, rows: Rows) -> None:
-        """Note the seed that `error` is about, if the observations of `rows` have stood in the place of `obs`.
+        """Refuse the seed that caused `error` in a call that used the rows `rows` of `obs`.
 
-        Raises the error where it names no seed, and where no seed is left.
+        Raises the error if it names no seed or if no seed is left.
         """
         lead = obs.shape[:-1]
         if error.sample is None or len(error.sample) < len(lead) or not self._has_seeds(obs):
             raise error
-        # The batch may have more leading dimensions than the observations, which repeat along those.
+        # The batch may have more leading dimensions than the observations, which broadcast along them.
         first, *others = error.sample[len(error.sample) - len(lead) :]
         row = first if rows is None else rows[first]
         self.refused[self.positions[row]] = refusal(error, obs[(row, *others)])
@@ -117,7 +120,7 @@ class Guard:
 
 
 def replace_methods(constraint: Constraint, wrap: Callable[[str, Callable], Callable]) -> Constraint:
-    """A copy of `constraint` with `wrap(name, method)` for each public method that takes observations."""
+    """A copy of `constraint` in which `wrap(name, method)` replaces each public method that takes observations."""
     changed = copy.copy(constraint)
     for name, function in inspect.getmembers(type(constraint), inspect.isfunction):
         if not name.startswith("_") and "obs" in inspect.signature(function).parameters:
@@ -126,7 +129,7 @@ def replace_methods(constraint: Constraint, wrap: Callable[[str, Callable], Call
 
 
 def _call_with(rows: Sequence[int], method: Callable, args: tuple, kwargs: dict[str, Any]) -> Any:
-    """The result of `method` for these rows of its observations and centres."""
+    """Call `method` with these rows of its observations and centres."""
     call = inspect.signature(method).bind(*args, **kwargs)
     obs, center = call.arguments["obs"], call.arguments.get("center")
     call.arguments["obs"] = obs[list(rows)]
@@ -136,9 +139,9 @@ def _call_with(rows: Sequence[int], method: Callable, args: tuple, kwargs: dict[
 
 
 def step_apart(step_together: StepTogether) -> StepTogether:
-    """`step_together` that returns a ConstraintError as the outcome of the environment that it is about.
+    """Wrap `step_together` to return a ConstraintError as the outcome of the environment that caused it.
 
-    It then steps each environment alone, because the error has come before any step.
+    After such an error it steps each environment alone. The error is raised before any environment steps.
     """
 
     def step(envs: Sequence[Any], actions: Any) -> Sequence[Any]:

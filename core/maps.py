@@ -1,7 +1,7 @@
-"""Feasibility maps: how the action that an actor suggests becomes an action inside the feasible set.
+"""Feasibility maps: they turn the action that an actor suggests into an action inside the feasible set.
 
-A new map is one class. It needs `__call__`; with `with_log_prob` it serves SAC as well as TD3. Its dataclass fields,
-made with `core.config.setting`, are keys of the command line for the algorithms that use the map.
+A new map is one class. TD3 needs only `__call__`, SAC also `with_log_prob`. The map's dataclass fields, made with
+`core.config.setting`, are keys of the command line for the algorithms that use the map.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ Placement = Literal["environment", "rollout", "layer"]
 
 
 class Sample(NamedTuple):
-    """Suggestions (..., d) that a stochastic actor has drawn.
+    """Suggestions (..., d) drawn by a stochastic actor.
 
-    `mean` and `std` (..., d) are those of the actor's normal distribution, which is before the tanh where there is one.
-    `log_prob` (...) is the log-density of `suggested` itself.
+    `mean` and `std` (..., d) belong to the actor's normal distribution, before any tanh. `log_prob` (...) is the
+    log-density of `suggested` itself.
     """
 
     suggested: Tensor
@@ -38,18 +38,18 @@ class Sample(NamedTuple):
 class Map(ABC):
     """A map into the feasible set.
 
-    Tensors are obs (..., n), actions and `center` (..., d). `center` is an interior point of the set at `obs`; it is
-    None where the agent has none at hand, and then the constraint computes its own.
+    Tensors are obs (..., n), actions and `center` (..., d). `center` is an interior point of the set at `obs`. If it is
+    None, the constraint computes one.
     """
 
     squashes: ClassVar[bool] = False
     """Whether a tanh keeps suggestions in the box [-1, 1]^d before they reach the map."""
     needs_center: ClassVar[bool] = True
-    """Whether the map uses a centre. The agent then computes it once a transition and replays it."""
+    """Whether the map uses a centre. If so, the agent computes it once for each observation and replays it."""
     placements: ClassVar[tuple[Placement, ...]] = ("layer",)
-    """The placements in which the map makes sense. The other two ask more of a map than "layer". Random actions are
-    suggestions there, so `pull_back` must be the map itself. Critics score suggestions as well as feasible actions, so
-    the map must leave feasible actions alone, and suggestions must stay in the box."""
+    """The placements that the map supports. "environment" and "rollout" demand more than "layer". Random actions are
+    suggestions there, so `pull_back` must equal the map. Critics score both suggestions and feasible actions, so the
+    map must not change feasible actions, and suggestions must stay in the box."""
 
     @abstractmethod
     def __call__(self, constraint: Constraint, obs: Tensor, suggested: Tensor, center: Tensor | None) -> Tensor:
@@ -62,36 +62,36 @@ class Map(ABC):
         raise NotImplementedError(f"{type(self).__name__} has no log-density")
 
     def pull_back(self, constraint: Constraint, obs: Tensor, action: Tensor, center: Tensor | None) -> Tensor:
-        """Map a random action (..., d) to a feasible one and leave feasible actions alone."""
+        """Map a random action (..., d) to a feasible one. Feasible actions stay as they are."""
         return constraint.alpha_map(obs, action, center)
 
     def limit_target(self, constraint: Constraint, obs: Tensor, action: Tensor, center: Tensor | None) -> Tensor:
-        """Put a target action (..., d), to which TD3 has added noise, back where the critic knows actions."""
+        """Map TD3's target action with noise (..., d) back to the actions on which the critic is trained."""
         return self.pull_back(constraint, obs, action, center)
 
     def configured(self, config: Config) -> Map:
-        """A copy of the map with the settings that `config` has of its fields."""
+        """A copy of the map whose fields have their values in `config`."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
         changed = {name: getattr(config, name) for name in own if getattr(config, name, own[name]) != own[name]}
-        # With its own settings, it keeps what it has learned. With others, it is made anew.
+        # With unchanged settings, the copy keeps what the map has learned. With others, it starts untrained.
         return replace(self, **changed) if changed else copy.deepcopy(self)
 
     def propose(self, constraint: Constraint, obs: Tensor, suggested: Tensor) -> Tensor:
-        """The action (..., d) before it is made feasible, whose violation training.csv has: the suggestion itself."""
+        """The action (..., d) before it is made feasible: the suggestion itself. training.csv logs its violation."""
         return suggested
 
     def use_untrained(self, constraint: Constraint, obs: Tensor) -> None:  # noqa: B027 - most maps learn nothing
-        """Do without what the map learns before a training, if it does: for checks, and to measure speed."""
+        """Make a map that learns usable without its own training, for checks and measurements of speed."""
 
     def state(self) -> dict[str, Tensor]:
-        """What the map has learned before a training, on the CPU. Saved parameters have it too."""
+        """What the map has learned before the agent's training, on the CPU. Saved parameters include it."""
         return {}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:  # noqa: B027 - most maps learn nothing
-        """Take what `state` has returned."""
+        """Load what `state` returned."""
 
     def replays_center(self, constraint: Constraint) -> bool:
-        """Whether the replay buffer has two centres a transition. The origin needs no storing."""
+        """Whether the replay buffer stores the two centres of each transition. The origin is not stored."""
         return self.needs_center and not constraint.origin_centered
 
     @classmethod
@@ -120,7 +120,7 @@ class Project(Map):
 
 @dataclass
 class RayMap(Map):
-    """A map along rays from the centre, with the setting of SAC's entropy that all of these have."""
+    """Base of the maps along rays from the centre, with their common setting of SAC's entropy."""
 
     entropy: str = setting(
         "paper",
@@ -175,7 +175,7 @@ class Radial(RayMap):
 
 @dataclass
 class Gauge(RayMap):
-    """The gauge map (Tabas and Zhang, 2022): it scales the box onto the set, ray by ray."""
+    """The gauge map (Tabas and Zhang, 2022), which scales the box onto the set along each ray."""
 
     squashes = True
 

@@ -1,4 +1,4 @@
-"""The moments of a training from which it can go on: a checkpoint of every seed, written and taken up together."""
+"""The moments from which a training can resume: checkpoints of all seeds, written and restored together."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class Moments:
         self.seeds, self.agent, self.replay = seeds, agent, replay
         self.evaluator, self.timer = evaluator, timer
         self.step: int | None = None
-        """The least step of a seed in the last moment, without those that had ended before; None before the first."""
+        """The step of the last moment: the smallest of the seeds that had not ended. None before the first moment."""
 
     def write(self, obs: Tensor, center: Tensor | None) -> None:
-        """Write a checkpoint of every seed; obs (seeds, n) and `center` (seeds, d) are the present ones.
+        """Write a checkpoint of every seed. obs (seeds, n) and `center` (seeds, d) are the current ones.
 
-        Where that fails, report it and keep the one before.
+        On an OSError, report it and keep the previous checkpoint.
         """
         moment = uuid.uuid4().hex
         try:
@@ -50,7 +50,7 @@ class Moments:
                     seed.checkpoints.discard()
 
     def restore(self, checkpoints: Sequence[Checkpoint], obs: Tensor, center: Tensor | None) -> None:
-        """Go back to the moment of `checkpoints`, one of each seed; obs and `center` receive those of that moment."""
+        """Restore the moment of `checkpoints`, one of each seed. Copy its observations and centres to obs, `center`."""
         states = [checkpoint.state() for checkpoint in checkpoints]
         # Everything is read before anything is written. A read error thus leaves every folder as it is.
         for seed, checkpoint, state in zip(self.seeds, checkpoints, states, strict=True):
@@ -74,7 +74,7 @@ class Moments:
         self.step = min(steps)
 
     def _state(self, seed: Seed, obs: Tensor, center: Tensor | None) -> dict[str, Any]:
-        """Everything about a seed but its transitions."""
+        """Everything about a seed except its transitions."""
         i = seed.position
         return seed.state() | {
             "obs": obs[i].clone(),
@@ -87,6 +87,6 @@ class Moments:
         }
 
     def _stored(self, seed: Seed) -> tuple[Callable[[int, int], list[Tensor]], int]:
-        """Where the transitions of a seed are in memory, and the number of the oldest one there."""
+        """The function that returns views of a seed's transitions, and the number of the oldest one in the buffer."""
         i = seed.position
         return partial(self.replay.stretch, i), max(0, self.replay.added[i] - self.replay.capacity)

@@ -15,11 +15,11 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class Linear(nn.Module):
-    """Parameters of affine maps side by side, one a row: weight (rows, inputs, outputs) and bias (rows, 1, outputs)."""
+    """Parameters of one affine map per row: weight (rows, inputs, outputs) and bias (rows, 1, outputs)."""
 
     def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]):
         super().__init__()
-        # PyTorch's own initialisation of nn.Linear, as in the paper's code base. (Without inputs, a bias is left.)
+        # PyTorch's own initialisation of nn.Linear, as in the paper's code base. (Without inputs, only a bias is left.)
         bound = 1 / math.sqrt(max(inputs, 1))
         weight = torch.empty(len(generators), inputs, outputs)
         bias = torch.empty(len(generators), 1, outputs)
@@ -30,7 +30,7 @@ class Linear(nn.Module):
 
 
 class Network(nn.Module):
-    """A module that has a target network: its parameters do not change their places."""
+    """A module that can have a target network: its parameter tensors are never replaced by others."""
 
     @cached_property
     def parameter_list(self) -> list[Tensor]:
@@ -49,7 +49,7 @@ class MLP(Network):
 
     def forward(self, x: Tensor) -> Tensor:
         """If `x` has fewer rows than the network, only the first rows of the weights are used."""
-        # On a small network Python and PyTorch's dispatch cost as much as the arithmetic, hence no calls of modules.
+        # On small networks, Python and PyTorch's dispatch take as long as the arithmetic, so modules are not called.
         rows, last = x.shape[0], len(self.layers) - 1
         for number, layer in enumerate(cast("Iterable[Linear]", self.layers)):
             weight: Tensor = layer.weight
@@ -63,7 +63,7 @@ class MLP(Network):
 
 
 class TwinCritic(Network):
-    """Two Q-functions a seed as one network of 2 * seeds rows: the first critics of all seeds, then the second."""
+    """Two Q-functions per seed as one network of 2 * seeds rows: the first critics of all seeds, then the second."""
 
     def __init__(self, obs_dim: int, action_dim: int, hidden: Sequence[int], generators: Sequence[torch.Generator]):
         super().__init__()
@@ -97,7 +97,7 @@ def soft_update(target: Network, source: Network, tau: float) -> None:
 
 
 class Adam(torch.optim.Adam):
-    """Adam with PyTorch's defaults; a step is one call of the fused kernel, and little else.
+    """Adam with PyTorch's defaults. A step is little more than one call of the fused kernel.
 
     The checks and hooks around PyTorch's own `step` take longer than the kernel on networks of this size.
     """
@@ -110,7 +110,7 @@ class Adam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """One step along the parameters' `grad`."""
+        """Take one step with the parameters' `grad`."""
         (group,) = self.param_groups
         parameters = group["params"]
         states = [self.state[parameter] for parameter in parameters]

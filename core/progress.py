@@ -1,4 +1,4 @@
-"""How far a training has come, for the person who watches it, and where its time goes."""
+"""Progress bars of a training, and the time that its phases take."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tqdm import tqdm
 from core.config import Config
 
 EVALUATION_DELAY = 2.0
-"""Seconds after which an evaluation has a bar of its own."""
+"""Seconds after which an evaluation shows its own bar."""
 
 
 class PhaseTimer:
-    """Seconds of a training, in all and by phase. The time between a stop and the resumption does not count."""
+    """Measures the seconds of a training, in total and by phase, without the time between a stop and the resumption."""
 
     def __init__(self, phases: Sequence[str]):
         self.phases = dict.fromkeys(phases, 0.0)
@@ -34,11 +34,11 @@ class PhaseTimer:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Seconds of each phase, and in "total" those since the start."""
+        """Seconds of each phase, and "total" seconds since the start."""
         return self.phases | {"total": time.perf_counter() - self.started}
 
     def restore(self, seconds: dict[str, float]) -> None:
-        """Go on from what `seconds` was."""
+        """Continue from a saved value of `seconds`."""
         self.phases = {phase: seconds[phase] for phase in self.phases}
         self.started = time.perf_counter() - seconds["total"]
 
@@ -70,12 +70,12 @@ class Progress:
 
     @contextmanager
     def evaluation(self, steps: int) -> Iterator[Callable[[int], Any]]:
-        """A bar below the other one while an evaluation of at most `steps` steps lasts, if it does not end at once."""
+        """Show a second bar during a long evaluation of at most `steps` steps. Yields a function that counts steps."""
         with self._bar("evaluation", steps, leave=False, delay=EVALUATION_DELAY) as bar:
             yield bar.update
 
     def advance(self, count: int, step: int) -> None:
-        """Count `count` environment steps; `step` is how far the seed furthest behind had come."""
+        """Count `count` environment steps. `step` is the step of the slowest seed before them."""
         if self.bars and step >= self.warm_up:
             self.bar.close()
             self.bar = self._next_bar()

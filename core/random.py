@@ -20,40 +20,40 @@ def stream_seed(seed: int, purpose: str, index: int = 0) -> int:
 
 
 class Streams:
-    """One generator a seed for one purpose. A draw stacks what each seed alone would have drawn.
+    """One generator per seed for one purpose. A draw stacks the numbers that each seed would draw alone.
 
-    Numbers are drawn on the CPU and then moved to the `device`. An algorithm uses `normal` and `uniform`; `indices` is
-    for the replay buffer.
+    Numbers are drawn on the CPU and then moved to `device`. Algorithms use `normal` and `uniform`; `indices` is for the
+    replay buffer.
     """
 
     def __init__(self, seeds: Sequence[int], purpose: str, device: torch.device | str = "cpu"):
         self.device = torch.device(device)
         self.generators = [torch.Generator().manual_seed(stream_seed(seed, purpose)) for seed in seeds]
         self.recorded: list[Draw] | None = None  # the draws since it was set to an empty list
-        self.ahead: Ahead | None = None  # has drawn the numbers of coming gradient steps, where these are captured
+        self.ahead: Ahead | None = None  # the numbers of future gradient steps, if these are captured
 
     def normal(self, *shape: int, which: Iterable[int] | None = None) -> Tensor:
         """Standard normal numbers (seeds, *shape). Rows outside `which` are zero and their streams stay untouched."""
         return self._numbers(Draw("normal", shape), which)
 
     def uniform(self, *shape: int, which: Iterable[int] | None = None) -> Tensor:
-        """Uniform numbers in [-1, 1), otherwise as `normal`."""
+        """Uniform numbers (seeds, *shape) in [-1, 1); `which` as in `normal`."""
         return self._numbers(Draw("uniform", shape), which)
 
     def indices(self, sizes: Sequence[int], count: int, sizes_there: Tensor | None = None) -> Tensor:
         """(seeds, count) integers on the device, row i uniform in [0, sizes[i]).
 
-        `sizes_there` (seeds, 1) has the sizes on the device, for steps that are captured.
+        `sizes_there` (seeds, 1) are the same sizes on the device, for steps that are captured.
         """
         draw = Draw("words", (count,))
         if self.ahead:
-            return self.ahead.take(draw) % sizes_there  # as `randint` makes a number of a word
+            return self.ahead.take(draw) % sizes_there  # as `randint` turns a word into a number
         self._record(draw)
         draws = [torch.randint(n, draw.shape, generator=g) for n, g in zip(sizes, self.generators, strict=True)]
         return torch.stack(draws).to(self.device)
 
     def state(self, i: int) -> Tensor:
-        """The state of the generator of the seed in position i. Numbers drawn ahead are not drawn yet."""
+        """The state of the generator of the seed in position i, as if no numbers had been drawn ahead."""
         return self.ahead.state(i) if self.ahead else self.generators[i].get_state()
 
     def load_state(self, i: int, state: Tensor) -> None:

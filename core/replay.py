@@ -11,19 +11,19 @@ from torch import Tensor
 from core.random import Streams
 
 MOST_WAITING = 1000
-"""Environment steps whose transitions go into the buffer at once, at most."""
+"""The most environment steps whose transitions wait before they go into the buffer together."""
 
 
 class Batch(NamedTuple):
     """Transitions (seeds, batch, features). The replay buffer has the columns in the same order.
 
-    The centres are None where the algorithm does not use any.
+    The centres are None if the algorithm stores none.
     """
 
     obs: Tensor
     action: Tensor
     reward: Tensor  # (seeds, batch)
-    terminated: Tensor  # (seeds, batch): 1 where the episode ended for good; a time limit is no end
+    terminated: Tensor  # (seeds, batch): 1 if the episode terminated, 0 otherwise, also at a time limit
     next_obs: Tensor
     center: Tensor | None = None
     next_center: Tensor | None = None
@@ -42,8 +42,8 @@ class Replay:
         device: torch.device | str = "cpu",
     ):
         self.capacity = capacity
-        # Most next observations are stored twice, as they come again in the next row. A transition is thus one stretch
-        # of memory, and sampling costs memory's latency.
+        # Most observations are stored twice: as next_obs, and as obs of the next row. Each transition is therefore one
+        # stretch of memory, and sampling is bound by memory latency.
         center_dim = action_dim if centers else 0
         widths = {"obs": obs_dim, "action": action_dim, "reward": 1, "terminated": 1, "next_obs": obs_dim}
         widths |= {"center": center_dim, "next_center": center_dim}
@@ -54,12 +54,12 @@ class Replay:
         self._rows[self.offsets] = 0.0  # a seed that fails at its first step has no transitions and samples this row
         self.everyone = [*range(len(seeds))]
         self.added = [0] * len(seeds)
-        # Transitions that each seed can sample, after `sizes_of` were added.
+        # Transitions that each seed can sample, as they were when `sizes_of` transitions had been added.
         self.sizes, self.sizes_of = torch.ones(len(seeds), 1, dtype=torch.int64, device=device), [0] * len(seeds)
-        # Transitions on their way: they go into the buffer, and to the device, in one piece before it is read.
+        # New transitions. They go to the device and into the buffer together, before the buffer is read.
         self.waiting: list[Tensor] = []
         self.places: list[int] = []
-        self.most_waiting = min(capacity, MOST_WAITING)  # no place twice
+        self.most_waiting = min(capacity, MOST_WAITING)  # so that no place occurs twice
         self.streams = Streams(seeds, "replay", device)
 
     @property
@@ -69,7 +69,7 @@ class Replay:
         return self._rows
 
     def add(self, which: Sequence[int], transitions: Batch) -> None:
-        """Append one transition to each seed of `which`. All columns are (seeds, features), with one reward each."""
+        """Append a transition to each seed in the positions `which`. All columns are (seeds, features), rewards too."""
         which = list(which)
         rows = torch.cat([column for column in transitions if column is not None], dim=-1)
         self.waiting.append(rows if which == self.everyone else rows[which])
@@ -80,7 +80,7 @@ class Replay:
             self._put()
 
     def flush(self) -> None:
-        """Put the transitions that wait into the buffer, without waiting for the device."""
+        """Put the waiting transitions into the buffer, without waiting for the device."""
         if self.waiting:
             self._put()
         if self.sizes_of != self.added:
@@ -102,7 +102,7 @@ class Replay:
         return [ring[first:], ring[:last]] if last else [ring[first:]]
 
     def sample(self, batch_size: int) -> Batch:
-        """`batch_size` transitions of every seed, uniform with replacement."""
+        """Draw `batch_size` transitions of every seed, uniformly with replacement."""
         indices = self.streams.indices(self._sizes(), batch_size, self.sizes) + self.offsets
         rows = self.rows.index_select(0, indices.flatten()).view(*indices.shape, -1)
         obs, action, reward, terminated, next_obs, *centers = rows.split(self.widths, dim=-1)
@@ -113,5 +113,5 @@ class Replay:
         return [min(max(n, 1), self.capacity) for n in self.added]
 
     def _there(self, tensor: Tensor) -> Tensor:
-        """A tensor from the CPU on the device."""
+        """Move a CPU tensor to the device."""
         return tensor.pin_memory().to(self.device, non_blocking=True) if self.device.type == "cuda" else tensor

@@ -1,4 +1,4 @@
-"""One seed of a training: its environment, its files, how far it has come and how it ended."""
+"""One seed of a training: its environment, files, counters and result."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ class Best(NamedTuple):
 
 @dataclass(eq=False)
 class Seed:
-    """What belongs to one seed. A seed that has ended stays in the batch, without an effect on its neighbours."""
+    """The state of one seed. A seed that has ended stays in the batch and does not affect the other seeds."""
 
-    number: int  # its random streams are made from it
+    number: int  # determines its random streams
     position: int  # its row in the learning tensors
     env: Any
     writer: RunWriter
     checkpoints: CheckpointFolder = field(init=False)
     steps: int = 0  # environment steps
-    rollout_steps: int = 0  # of the present rollout
-    owed: int = 0  # gradient steps that it must take before it goes on collecting
+    rollout_steps: int = 0  # in the current rollout
+    owed: int = 0  # gradient steps that it must take before its next environment step
     gradient_steps: int = 0
     evaluated: int = 0  # the step of its last evaluation
-    suggestions: Suggestions = field(default_factory=Suggestions)  # since then
+    suggestions: Suggestions = field(default_factory=Suggestions)  # since its last evaluation
     best: Best | None = None
-    result: dict[str, Any] | None = None  # of a seed that has finished
-    failure: dict[str, Any] | None = None  # of one that has diverged
-    recorded: bool = False  # whether its folder tells how it ended
+    result: dict[str, Any] | None = None  # if it has finished
+    failure: dict[str, Any] | None = None  # if it has diverged
+    recorded: bool = False  # whether its folder has the result or the failure
 
     def __post_init__(self) -> None:
         self.checkpoints = CheckpointFolder(self.writer.folder)
@@ -55,13 +55,13 @@ class Seed:
 
     @property
     def result_due(self) -> bool:
-        """Whether it has diverged, and the best parameters before that have not had their final evaluation yet."""
+        """Whether the seed has diverged and its best parameters still need their final evaluation."""
         has_best = self.best is not None and math.isfinite(self.best.mean)
         return self.failure is not None and "result" not in self.failure and has_best
 
     @property
     def is_measured(self) -> bool:
-        """Whether its next suggestion is one of those that `suggestions` counts."""
+        """Whether `suggestions` measures the seed's next suggestion."""
         return self.steps % EVERY == 0
 
     def count_step(self, config: Config, episode_over: bool) -> bool:
@@ -85,7 +85,7 @@ class Seed:
         self.writer.save_parameters("best", best.parameters)
 
     def record_end(self, parameters: Mapping[str, Tensor]) -> None:
-        """Write to the seed's folder how it ended; `parameters` are its last ones."""
+        """Write the result and the last `parameters`, or the failure, to the seed's folder."""
         if self.result is not None:
             self.writer.save_parameters("last", parameters)
             self.writer.finish(self.result)
@@ -94,7 +94,7 @@ class Seed:
         self.recorded = True
 
     def state(self) -> dict[str, Any]:
-        """Its part of a checkpoint."""
+        """This object's part of a checkpoint."""
         return {
             "counters": {name: getattr(self, name) for name in COUNTERS},
             "suggestions": asdict(self.suggestions),
@@ -106,7 +106,7 @@ class Seed:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go back to what `state` returned."""
+        """Restore what `state` returned."""
         for name in COUNTERS:
             setattr(self, name, state["counters"][name])
         self.suggestions = Suggestions(**state["suggestions"])

@@ -1,4 +1,4 @@
-"""The half of `core.agent.Agent` that handles one seed's share of its tensors: copying, restoring, clearing, checks."""
+"""The part of `core.agent.Agent` that copies, restores, clears and checks the rows of one seed in its tensors."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Snapshots(ABC):
     def networks(self) -> dict[str, nn.Module]:
         """The learned modules by name.
 
-        Each parameter's leading axis has k rows a seed: first those of all seeds in order, then the second of all
-        seeds, and so on. k is 1 for most modules and 2 for `core.networks.TwinCritic`; any k works.
+        Each parameter's leading axis has k rows per seed: the first row of every seed in order, then the second row of
+        every seed, and so on. k is 1 for most modules and 2 for `core.networks.TwinCritic`; any k works.
         """
 
     @abstractmethod
@@ -36,7 +36,7 @@ class Snapshots(ABC):
         """The random streams by name."""
 
     def memory(self) -> dict[str, Tensor]:
-        """Tensors (seeds, ...) that the future depends on, beside networks, optimisers and random streams.
+        """Tensors (seeds, ...) that later steps depend on, besides networks, optimisers and random streams.
 
         Return the tensors themselves, not copies: resuming writes into them.
         """
@@ -60,7 +60,7 @@ class Snapshots(ABC):
         for name, optimizer in self.optimizers().items():
             for number, parameter in enumerate(parameters_of(optimizer)):
                 for key, value in optimizer.state[parameter].items():
-                    # Adam's moments have a row a seed, its step count is one for all.
+                    # Adam's moments have rows for each seed. All seeds share its step count.
                     rows = self._rows(value)[:, i] if value.dim() else value
                     optimizers[f"{name}.{number}.{key}"] = _copy(rows)
         return {
@@ -73,7 +73,7 @@ class Snapshots(ABC):
 
     @torch.no_grad()
     def load_training_state(self, i: int, state: dict[str, Any]) -> None:
-        """Put what `training_state` returned back into position i. All seeds must have taken as many updates."""
+        """Put what `training_state` returned back into position i. All seeds must have taken equally many updates."""
         self.load_state(i, state["parameters"])
         for key, saved in state["optimizers"].items():
             name, number, quantity = key.split(".")
@@ -102,7 +102,7 @@ class Snapshots(ABC):
 
     @torch.no_grad()
     def infinite_parameter(self, i: int) -> str | None:
-        """The name of a parameter of seed i that is not finite, None where all are."""
+        """The name of a parameter of seed i that is not finite; None if all are finite."""
         for name, parameter in self._parameters():
             if not self._rows(parameter)[:, i].isfinite().all():
                 return name
@@ -114,7 +114,7 @@ class Snapshots(ABC):
                 yield f"{module_name}.{name}", parameter
 
     def _rows(self, tensor: Tensor) -> Tensor:
-        """View (k, seeds, ...) of a parameter with k rows a seed, or of a tensor of its shape."""
+        """View (k, seeds, ...) of a parameter with k rows per seed, or of a tensor of the same shape."""
         return tensor.view(-1, len(self.seeds), *tensor.shape[1:])
 
 

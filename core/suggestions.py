@@ -6,26 +6,26 @@ import math
 from dataclasses import dataclass
 
 EVERY = 10
-"""One of so many environment steps of a seed is measured: a measurement costs some percent of a step on a GPU."""
+"""Every this many environment steps of a seed, one is measured. That takes a few percent of a step's time on a GPU."""
 
 
 @dataclass
 class Suggestions:
-    """The suggestions of one seed since its last evaluation, with exploration noise, as the map is given them."""
+    """Measures of one seed's suggestions, with exploration noise, since its last evaluation (`Agent.proposed`)."""
 
     count: int = 0
     infeasible: int = 0
-    violation: float = 0.0  # sum over all, zero for feasible ones, in the units of `Constraint.violation`
+    violation: float = 0.0  # sum over all suggestions, 0 for feasible ones, in units of `Constraint.violation`
 
     def add(self, violation: float) -> None:
-        """Count a suggestion; its `violation` is at most 0 where it is feasible."""
+        """Count a suggestion. Its `violation` is at most 0 if it is feasible."""
         self.count += 1
         if violation > 0.0:
             self.infeasible += 1
             self.violation += violation
 
     def take(self) -> dict[str, float]:
-        """The mean violation and the share of infeasible suggestions, NaN without any. The count starts again."""
+        """Return the mean violation and the share of infeasible suggestions, NaN without any. Start a new count."""
         measures = {
             "suggested_violation": self.violation / self.count if self.count else math.nan,
             "suggested_infeasible": self.infeasible / self.count if self.count else math.nan,

@@ -1,7 +1,7 @@
 """The training loop: S seeds of one (algorithm, task) cell in one process.
 
-Each seed follows its own schedule of rollouts and gradient steps, exactly as it would alone. The seeds share only the
-arithmetic: those that owe gradient steps wait until all do, and then take them in one batch of matrix products.
+Each seed follows its own schedule of rollouts and gradient steps, exactly as it would alone. Only the arithmetic is
+shared: a seed that owes gradient steps waits until all do. They take these steps in one batch of matrix products.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from store.writer import RunWriter
 
 
 class Trainer:
-    """Trains `agent` on its seeds and writes one run folder a seed.
+    """Trains `agent` on its seeds and writes one run folder per seed.
 
-    `stop_if_asked` is called between any two steps. It raises Interrupted to end the training there, with a checkpoint.
+    `stop_if_asked` is called between any two steps. It raises Interrupted to stop the training with a checkpoint.
     """
 
     def __init__(
@@ -73,11 +73,11 @@ class Trainer:
         self.show_progress = progress
 
     def run(self) -> list[dict | None]:
-        """Train every seed to the end. Returns their results, one dict a seed, None for a seed that diverged.
+        """Train every seed to the end. Returns one result per seed, None for a seed that diverged.
 
-        After an Interrupted everything is in a checkpoint. Any early end saves the last parameters. An error that
-        belongs to one seed ends that seed alone (`failed.json` says where); any other one is raised, after a line
-        on stderr that names algorithm, task and step.
+        Before an Interrupted is raised, a checkpoint is written. Any exception saves the last parameters. An error that
+        belongs to one seed ends that seed alone (`failed.json` has the step and the reason). Any other error is raised
+        after a line on stderr that names algorithm, task and step.
         """
         self.progress = Progress(self.config, [seed.steps for seed in self.seeds], self.show_progress)
         self.evaluator.watch = self.progress.evaluation
@@ -88,7 +88,7 @@ class Trainer:
                 self.stop_if_asked()
                 if self._all_steps() - self.steps_at_checkpoint >= self.config.checkpoint_every * len(live):
                     self._checkpoint()
-                    continue  # it may end seeds
+                    continue  # a checkpoint may end seeds
                 self._sparing(self._advance, live)
         except BaseException as error:
             if isinstance(error, Interrupted):
@@ -108,12 +108,12 @@ class Trainer:
         return [seed.result for seed in self.seeds]
 
     def _sparing(self, part: Callable[..., None], *arguments: Any) -> None:
-        """Call `part`. A seed ends if the constraint breaks down at one of its observations, and the others go on."""
+        """Call `part`. A seed ends if the constraint fails at one of its observations. The other seeds continue."""
         try:
             part(*arguments)
         except ConstraintError:
             self._fail_refused()
-            if not all(seed.ended for seed in self.seeds):  # it is about no single seed
+            if not all(seed.ended for seed in self.seeds):  # the error belongs to no single seed
                 raise
         self._fail_refused()
 
@@ -126,9 +126,9 @@ class Trainer:
         return f"the constraint of {self.config.env}: {reason}"
 
     def _report(self, error: Exception) -> None:
-        """Say where an error came that ends all seeds, and what is left of the training.
+        """Print where the error occurred and from which step training can resume.
 
-        There is no new checkpoint: training could not go on exactly from the middle of a step.
+        There is no new checkpoint: training could not resume exactly from the middle of a step.
         """
         from_step = self.moments.step
         rest = "no checkpoint yet" if from_step is None else f"the same command resumes from step {from_step}"
@@ -137,7 +137,7 @@ class Trainer:
         print(f"{where}: {type(error).__name__} ({rest})", file=sys.stderr)
 
     def _live(self) -> list[Seed]:
-        """The seeds that have not ended. The folders of the others tell from here on how they did."""
+        """Return the seeds that have not ended, after writing the results of those that have."""
         while ended := [seed for seed in self.seeds if seed.ended and not seed.recorded]:
             if due := [seed for seed in ended if seed.result_due]:
                 self._evaluate_failed(due)
@@ -158,7 +158,7 @@ class Trainer:
     def _advance(self, live: Sequence[Seed]) -> None:
         """Take the next step of the seeds that have not ended.
 
-        It depends on the state alone. Training from a checkpoint between any two calls is thus the same training.
+        The step depends on the state alone. A training that resumes between two calls is thus the same training.
         """
         every, last = self.config.eval_every, self.config.steps
         due = [s for s in live if s.steps > s.evaluated and (s.steps % every == 0 or s.steps == last)]
@@ -174,13 +174,13 @@ class Trainer:
     # ---------------------------------------------------------------- learning
 
     def _update(self, live: Sequence[Seed]) -> None:
-        """One gradient step. All seeds that have not ended owe some."""
+        """Take one gradient step of the seeds `live`, which all owe one."""
         with self.timer.timed("update"):
             self.take_gradient_step()
             for seed in live:
                 seed.owed -= 1
                 seed.gradient_steps += 1
-            # Asking a GPU means waiting for it, so it is asked at the end of a block. An infinite loss stays infinite.
+            # Reading losses waits for the GPU, so it is done when a seed owes no more. An infinite loss stays infinite.
             if self.agent.device.type == "cpu" or not all(seed.owed for seed in live):
                 for i, quantity in self.agent.diverged().items():
                     self._fail(self.seeds[i], f"{quantity} is not finite")
@@ -240,7 +240,7 @@ class Trainer:
             self.agent.start_rollout(new_rollout)
 
     def _outcomes(self, seeds: Sequence[Seed], suggested: np.ndarray, executed: np.ndarray) -> list[tuple[Seed, tuple]]:
-        """Step the environments of `seeds`: what `step` returned, without the seeds that fail here."""
+        """Step the environments of `seeds`. Return the result of `step` for each seed that does not fail here."""
         finite = np.isfinite(suggested).all(-1)
         sound = []
         for seed in seeds:
@@ -289,7 +289,7 @@ class Trainer:
         self.progress.show_evaluation(float(returns.mean()), best)
 
     def _play(self, policy: Callable[[torch.Tensor], torch.Tensor], which: Sequence[int], episodes: int) -> np.ndarray:
-        """The returns (len(which), episodes) of `policy`, that of the seeds in the positions `which`."""
+        """The returns (len(which), episodes) of `policy` for the seeds in the positions `which`."""
         with self.guard.of(which) as refused:
             apart = self.guard.apart(lambda obs: policy(obs.to(self.agent.device)).cpu())
             returns = self.evaluator.run(apart, which, episodes)
@@ -297,22 +297,22 @@ class Trainer:
         return returns
 
     def _finish(self, seeds: Sequence[Seed]) -> None:
-        """Evaluate the best parameters of `seeds` at length, for the result."""
+        """Run the final evaluation of the best parameters of `seeds`, which gives their results."""
         self.progress.show_final_evaluation()
         for seed, result in zip(seeds, self._final_results(seeds), strict=True):
             if isinstance(result, str):
                 self._fail(seed, result)
-                seed.failure["result"] = None  # those parameters are what has just failed
+                seed.failure["result"] = None  # the best parameters have just failed
             else:
                 seed.result = result | self._counts(seed) | {"seeds_in_lockstep": len(self.seeds)}
 
     def _evaluate_failed(self, seeds: Sequence[Seed]) -> None:
-        """Evaluate the best parameters of `seeds`, which have diverged, for the result in their failures."""
+        """Run the final evaluation of the best parameters of diverged `seeds`, for the result in their failures."""
         for seed, result in zip(seeds, self._final_results(seeds), strict=True):
             seed.failure |= self._counts(seed) | {"result": result}
 
     def _final_results(self, seeds: Sequence[Seed]) -> list[dict[str, Any] | str]:
-        """The final evaluation of the best parameters of each of `seeds`; the reason where it was refused."""
+        """The result of the final evaluation of each of `seeds`, or the reason why an action was refused."""
         which = [seed.position for seed in seeds]
         last = {i: self.agent.state(i) for i in which}
         try:
@@ -339,7 +339,7 @@ class Trainer:
             "steps": seed.steps,
             "gradient_steps": seed.gradient_steps,
             "executed_actions": sum(env.executed_actions for env in envs),
-            # (no number before the first action: JSON has no infinity)
+            # (None before the first action, because JSON has no infinity)
             "largest_violation": max((env.largest_violation for env in envs if env.executed_actions), default=None),
             "seconds": self.timer.seconds,
         }
@@ -351,7 +351,7 @@ class Trainer:
         return name is not None
 
     def _fail(self, seed: Seed, reason: str) -> None:
-        """End a seed that has diverged, without an effect on its neighbours."""
+        """End a seed that has diverged, without an effect on the other seeds."""
         if not seed.ended:
             seed.writer.save_parameters("last", self.agent.state(seed.position))
             last = seed.best and seed.writer.last_finite_evaluation()
@@ -359,9 +359,9 @@ class Trainer:
         self.agent.clear(seed.position)
 
     def _record_ends(self) -> None:
-        """Write to the folders of the seeds that have ended how they did.
+        """Write the results and failures of the seeds that have ended to their folders.
 
-        A checkpoint comes first. Until all seeds have ended, a resumption needs each of them for the same batch.
+        A checkpoint comes first. Until all seeds have ended, a resumption needs every seed for the same batch.
         """
         self._checkpoint()
         for seed in self.seeds:
@@ -381,7 +381,7 @@ class Trainer:
     # ---------------------------------------------------------------- checkpoints
 
     def _checkpoint(self) -> None:
-        """Write a checkpoint of every seed."""
+        """Write a checkpoint of every seed, after ending the seeds with a parameter that is not finite."""
         self.steps_at_checkpoint = self._all_steps()
         with self.timer.timed("checkpoint"):
             for seed in self.seeds:
@@ -390,7 +390,7 @@ class Trainer:
             self.moments.write(self.obs, self.center)
 
     def restore(self, checkpoints: Sequence[Checkpoint]) -> None:
-        """Go on with the training where `checkpoints`, one of each seed and all of one moment, were written."""
+        """Resume the training from `checkpoints`, one of each seed and all of the same moment."""
         self.moments.restore(checkpoints, self.obs, self.center)
         self.steps_at_checkpoint = self._all_steps()
         self.began = True

@@ -1,4 +1,4 @@
-"""Words of a command line: `key=value`, lists of names, whole numbers, and the name that a misspelt one may mean."""
+"""The words of a command line: `key=value`, lists of names, whole numbers, and suggestions for misspelt names."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import TypeVar
 
 Row = TypeVar("Row")
 FEW = 20
-"""With more choices than that, a message that suggests one does not list the others."""
+"""A message that suggests a name also lists all choices, unless there are more than this."""
 GROUPS = ("all", "paper")
-"""Names on a command line that stand for several."""
+"""Words on a command line that stand for several names."""
 
 
 class ConfigError(ValueError):
-    """A setting that the user can correct. The message is one line that names the value and the choices."""
+    """A mistake that the user can correct. The message is one line that names the value and the choices."""
 
 
 class NameTable(MutableMapping[str, Row]):
-    """A table by names that appear on command lines and in the folders of runs; `kind` says what they name.
+    """A dict whose keys are names on command lines and in run folders; `kind`, such as "task", is for messages.
 
-    Raises ValueError for a name that exists, because runs are known by it, and for one that cannot be a word, a part of
-    a comma list and a folder. `del` makes a name free again.
+    Raises ValueError for a name that is taken, because it identifies runs, and for a name that cannot be used as a
+    word, in a comma list and in a folder's name. `del` frees a name.
     """
 
     def __init__(self, kind: str):
@@ -64,7 +64,7 @@ class NameTable(MutableMapping[str, Row]):
 
 
 def known_name(kind: str, value: object, choices: Iterable[str]) -> str:
-    """Return `value` if it is one of `choices`. Otherwise raise a ConfigError that names the closest one, or them."""
+    """Return `value` if it is one of `choices`. Otherwise raise a ConfigError with the closest, or with all."""
     choices, text = list(choices), str(value)
     if text in choices:
         return text
@@ -75,7 +75,7 @@ def known_name(kind: str, value: object, choices: Iterable[str]) -> str:
 
 
 def closest(text: str, choices: Iterable[str]) -> str | None:
-    """The name out of `choices` that a misspelt `text` may mean."""
+    """The name in `choices` that a misspelt `text` may mean; None if no name is similar."""
     by_folded = {choice.casefold(): choice for choice in choices}
     close = difflib.get_close_matches(text.casefold(), by_folded, n=1, cutoff=0.6)
     return by_folded[close[0]] if close else None
@@ -103,9 +103,10 @@ def parse_words(words: Iterable[str], keys: Iterable[str], free: str | None = No
 def split_names(
     kind: str, value: str, choices: Iterable[str], groups: Mapping[str, Collection[str]] | None = None
 ) -> list[str]:
-    """Split a comma list of `choices` and of names of `groups`, each name once, in the order of the list.
+    """Split a comma list into names out of `choices`, each once, in the order of the list.
 
-    `all` is a group too: all of `choices`. Raises ConfigError for an unknown name.
+    The list may also name groups, which stand for their members; `all` stands for all `choices`. Raises ConfigError for
+    an unknown name.
     """
     choices = list(choices)
     groups = {**(groups or {}), "all": choices}

@@ -6,7 +6,7 @@
 
 A state file is a line with the SHA-256 of the rest, then a `torch.save` of tensors, numbers and text. It is read with
 `weights_only`, so nothing in it is executed. It names its replay files, with their checksums. Each file is complete
-and on disk before the next one names it, and only then are older files deleted. A crash at any point therefore leaves
+and on disk before another file names it. Older files are deleted only after that. A crash at any point therefore leaves
 a whole checkpoint.
 
 The seeds of a lockstep group share the `moment` of a checkpoint. If all of them resume from one moment, they repeat
@@ -29,10 +29,10 @@ from store.files import one_line, replace_file
 from store.tensors import load_tensors, save_tensors
 
 Stretch = Callable[[int, int], Sequence[torch.Tensor]]
-"""Maps `start` and `stop` to views of one seed's transitions `start` to `stop` - 1, a row of float32 each."""
+"""Maps `start` and `stop` to views of one seed's transitions `start` to `stop` - 1, each a row of float32."""
 
 FORMAT = 4
-"""Counts the changes of what a checkpoint holds."""
+"""The version of a checkpoint's content."""
 
 _DAMAGES = (OSError, ValueError, KeyError, TypeError, RuntimeError, pickle.UnpicklingError)
 
@@ -67,11 +67,11 @@ class Checkpoint:
     replay_files: tuple[ReplayFile, ...]
 
     def state(self) -> dict[str, Any]:
-        """The state that `CheckpointFolder.write` was given."""
+        """The state that `CheckpointFolder.write` received."""
         return load_tensors(self.path)["state"]
 
     def fill(self, stretch: Stretch, oldest: int) -> None:
-        """Copy the transitions from `oldest` on, the first that the buffer holds, into the views of `stretch`."""
+        """Copy the transitions from number `oldest` on, the first in the buffer, into the views of `stretch`."""
         for name, start, stop, _ in self.replay_files:
             kept = max(start, oldest)
             views = stretch(kept, stop)
@@ -109,7 +109,7 @@ class CheckpointFolder:
         oldest: int,
         stop: int,
     ) -> None:
-        """Write the state and the new transitions of a seed. Its buffer holds `oldest` to `stop` - 1.
+        """Write the state and the new transitions of a seed. Its buffer holds the transitions `oldest` to `stop` - 1.
 
         Raises OSError if that fails.
         """
@@ -121,7 +121,7 @@ class CheckpointFolder:
         self.written = files
 
     def keep(self) -> None:
-        """Make the written checkpoint the newest one, and delete all but the one before it."""
+        """Make the written checkpoint the newest one. Of the older ones, keep only the one before it."""
         self.serial, self.files, self.previous_files = self.serial + 1, self.written, self.files
         self.discard()
 
@@ -210,9 +210,9 @@ def group_checkpoints(
 ) -> tuple[list[dict[int, Checkpoint]], list[int]]:
     """Groups of seeds that resume together, each seed with its checkpoint, and the seeds that start anew.
 
-    `intact` maps each seed to its checkpoints, newest first; `started` to the group that it started in. Picks the
-    moment that most seeds have, the newest on a tie, and repeats that for the others. (After a crash between two
-    writes, that is the previous moment.) The beginning is a moment too, if at most one checkpoint followed it.
+    `intact` maps each seed to its checkpoints, newest first; `started` maps it to the group that it started in. Picks
+    the moment that most seeds have, the newest on a tie, and repeats that for the other seeds. (After a crash between
+    two writes, the previous moment is picked.) The beginning is a moment too, if at most one checkpoint followed it.
     """
     moments: dict[Any, dict[int, Checkpoint | None]] = {}
     for seed, checkpoints in intact.items():

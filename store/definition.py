@@ -1,9 +1,9 @@
-"""What a run is trained on, as text: the task's constraint and robot, and the algorithm, with their parameters.
+"""Describes a run's task (constraint and robot) and its algorithm as text, with their parameters.
 
-Names of tasks and algorithms do not tell what they stand for: a user's own can change between two runs. A description
+The name of a task or an algorithm does not determine it: the user's own can change between two runs. A description
 maps paths, such as `constraint.bound`, to text that is the same in every process and Python version: values, and the
-source of functions and of the user's classes. The project's own classes are described by their name, as the commit in
-info.json stands for their code. `differences` says what has changed between two descriptions.
+source of functions and of the user's classes. The project's own classes are described by their names, because the
+commit in info.json determines their code. `differences` lists the changes between two descriptions.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from store.source import imports_in, names_in, source_of, without_source
 Description = dict[str, str]
 
 _USER = "user code"
-"""The key that a description has if something of it is the user's code."""
+"""The key that a description has if it includes the user's code."""
 _SHOWN = 3
 """The most differences that a message lists."""
 _PRINTED = 16
-"""The most numbers of an array that are written out; of larger ones, the checksum is."""
+"""The most numbers of an array that are written out. Larger arrays are described by a checksum."""
 _WIDTH = 70
 _PLAIN = (type(None), type(...), bool, int, float, complex, str, bytes, range, slice, PurePath, re.Pattern)
 _SEQUENCES = (list, tuple, deque)
@@ -49,13 +49,13 @@ _WRAPPERS: dict[type, tuple[str, ...]] = {
     staticmethod: ("__func__",),
     classmethod: ("__func__",),
 }
-"""What is behind a function, for things that hold one."""
+"""The attributes of each kind of wrapper that hold its function and arguments."""
 _RANDOM = ("Generator", "BitGenerator", "RandomState", "Random", "SeedSequence")
-"""Classes of random generators, whose states are another in every process."""
+"""Classes of random generators, whose states differ between processes."""
 
 
 def describe(parts: Mapping[str, Any]) -> Description:
-    """The description of named objects: constraints, classes, functions, numbers, tensors, or what holds such."""
+    """Describe named objects: constraints, classes, functions, numbers, tensors, or objects that hold such."""
     describer = _Describer()
     for name, value in parts.items():
         describer.add(name, value)
@@ -63,14 +63,14 @@ def describe(parts: Mapping[str, Any]) -> Description:
 
 
 def is_own(description: Mapping[str, str]) -> bool:
-    """Whether nothing described is the user's code."""
+    """Whether the description includes no code of the user."""
     return _USER not in description
 
 
 def differences(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """What differs between two descriptions, in one line; empty if nothing does."""
     changed = [key for key in {**before, **now} if before.get(key) != now.get(key) and key != _USER]
-    # A value tells more than the source around it, and the outermost thing more than what is in it.
+    # A value tells more than the source around it, and an outer path more than the paths inside it.
     changed.sort(key=lambda key: ("\n" in before.get(key, "") + now.get(key, ""), key.startswith("class ")))
     kept: list[str] = []
     for key in changed:
@@ -93,7 +93,7 @@ def _in_words(key: str) -> str:
 
 
 def _first_difference(before: str | None, now: str | None) -> tuple[str | None, str | None]:
-    """The values of one key; of sources, the first lines that differ."""
+    """The two values of one key. For texts of several lines, the first two lines that differ."""
     if before is None or now is None or "\n" not in before + now:
         return before, now
     lines = zip([*before.splitlines(), ""], [*now.splitlines(), ""], strict=False)
@@ -108,13 +108,13 @@ def _shorten(text: str | None) -> str:
 
 
 class _Describer:
-    """Collects the description. Each object is described once; later paths name the first."""
+    """Collects the description. Each object is described once; later paths refer to its first path."""
 
     def __init__(self) -> None:
         self.found: Description = {}
         self.paths: dict[int, str] = {}
         self.classes: set[type] = set()
-        self.kept: list[Any] = []  # alive, so that no other object gets their identity
+        self.kept: list[Any] = []  # keeps objects alive, so that no other object gets their id
 
     def add(self, path: str, value: Any) -> None:
         path = self._free(path)
@@ -150,7 +150,7 @@ class _Describer:
             self._object(path, value)
 
     def _free(self, path: str) -> str:
-        """`path`, or where two things have it, as two keys of a dictionary with the same text, a longer one."""
+        """`path`, or a longer one if it is taken: two keys of a dictionary may have the same text."""
         while path in self.found:
             path += "'"
         return path
@@ -172,7 +172,7 @@ class _Describer:
                 if getattr(value, part) is not None:
                     self.add(f"{path}.{part.strip('_')}", getattr(value, part))
         elif name := getattr(value, "__qualname__", None) or getattr(value, "__name__", None):
-            self.found[path] = str(name)  # a library's function that is not written in Python
+            self.found[path] = str(name)  # a library function that is not written in Python
             of = getattr(value, "__wrapped__", getattr(value, "__self__", None))
             if of is not None and not isinstance(of, (type, types.ModuleType)):
                 self.add(f"{path}.of", of)
@@ -183,7 +183,7 @@ class _Describer:
                 self.add(f"{path}.{name}", item)
 
     def _class(self, kind: type) -> None:
-        """What a user's class and its bases define."""
+        """Describe the attributes of a user's class and of its bases, if these are the user's too."""
         for base in kind.__mro__:
             if not is_user(base) or base in self.classes:
                 continue
@@ -199,7 +199,7 @@ class _Describer:
         if is_user(function):
             self.found[_USER] = "yes"
         elif not is_project(module_of(function)):
-            self.found[path] = f"{module_of(function)}.{function.__qualname__}"  # a library's
+            self.found[path] = f"{module_of(function)}.{function.__qualname__}"  # a library function
             if hasattr(function, "__wrapped__"):
                 self.add(f"{path}.of", function.__wrapped__)
             return
@@ -207,7 +207,7 @@ class _Describer:
         self._uses(path, function)
 
     def _uses(self, path: str, function: types.FunctionType) -> None:
-        """Defaults, closures, imports and the globals of a function that are values or the user's code."""
+        """Describe the closure, defaults, globals and imports that a function uses: values and the user's code."""
         code, names = function.__code__, sorted(names_in(function.__code__))
         for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
             if name != "__class__" and cell != types.CellType():
@@ -225,7 +225,7 @@ class _Describer:
                 self._used(f"{path}.{name}", importlib.import_module(name), names)
 
     def _used(self, path: str, item: Any, names: Sequence[str], inside: tuple[types.ModuleType, ...] = ()) -> None:
-        """A variable of a function that uses `names`; of a user's module, what has one of those names."""
+        """Describe a variable of a function that uses `names`. Of a user's module, only those names are described."""
         if isinstance(item, types.ModuleType):
             if is_user_module(item.__name__) and item not in inside:
                 for name in names:
@@ -245,7 +245,7 @@ def _is_library(item: Any) -> bool:
 
 
 def _is_made_by_python(kind: type, name: str, item: Any) -> bool:
-    """Whether a class has this only because it is a class, a dataclass, a named tuple or an Enum."""
+    """Whether Python made this attribute for the class, or for a dataclass, a named tuple or an Enum."""
     private = ("_",) if issubclass(kind, Enum) or hasattr(kind, "_fields") else ("__", "_abc_")
     if isinstance(item, types.FunctionType):
         written = inspect.unwrap(item)
@@ -261,13 +261,13 @@ def _is_plain(value: Any) -> bool:
 
 def _plain(value: Any) -> str:
     if isinstance(value, (str, PurePath)) and os.path.isabs(value) and os.path.isdir(value):
-        return "a folder"  # its name changes where code and data are moved
+        return "a folder"  # its name changes if code and data are moved
     if isinstance(value, PurePath):
         return value.name
     if isinstance(value, re.Pattern):
         return f"{value.pattern!r}, flags {value.flags}"
     if isinstance(value, str):
-        return re.sub(r"^/.*/(?=.)", "", value)  # of a path on this machine, the last part
+        return re.sub(r"^/.*/(?=.)", "", value)  # only the last part of an absolute path
     if isinstance(value, (*_SETS, tuple)):
         items = map(_plain, value)
         return f"({', '.join(items if isinstance(value, tuple) else sorted(items))})"
@@ -275,7 +275,7 @@ def _plain(value: Any) -> str:
 
 
 def _as_array(value: Any) -> np.ndarray | None:
-    """An array, a tensor, a number of NumPy or another library's table, as an array."""
+    """Convert an array, a tensor, a NumPy number or another library's table to an array; None for other values."""
     if isinstance(value, (np.ndarray, np.generic)):
         return np.asarray(value)
     if hasattr(value, "detach") and hasattr(value, "cpu"):
@@ -294,20 +294,20 @@ def _array(array: np.ndarray) -> str:
 
 
 def _state(value: Any) -> dict[str, Any]:
-    """What an object was made with, as far as it tells."""
+    """The attributes that determine an object, as far as they can be read."""
     import torch  # only here: reading results needs no torch
 
     kind = type(value)
     if not is_user(kind) and not is_project(module_of(kind)):
-        with contextlib.suppress(Exception):  # whatever an object without a text raises
-            repr(value)  # some objects keep their text from then on, as Gymnasium's boxes do
+        with contextlib.suppress(Exception):  # an object may raise anything here
+            repr(value)  # some objects store their text when first asked, such as Gymnasium's boxes
     slots = (name for base in kind.__mro__ for name in _slots_of(base))
     attributes = {name: getattr(value, name) for name in slots if hasattr(value, name)}
     attributes |= getattr(value, "__dict__", {})
     attributes = {name: item for name, item in attributes.items() if not _is_cached(kind, name)}
     public = {name: item for name, item in attributes.items() if not name.startswith("_")}
     if is_project(module_of(kind)):
-        # What it was made with. Other attributes, such as results that it keeps, follow from that.
+        # The constructor's arguments. Other attributes, such as cached results, follow from them.
         return _arguments(value, attributes) or public
     if isinstance(value, torch.nn.Module):
         own = {name: item for name, item in attributes.items() if name not in vars(torch.nn.Module())}
@@ -315,21 +315,21 @@ def _state(value: Any) -> dict[str, Any]:
     if is_user(kind):
         kept = _internals(kind)
         return {name: item for name, item in attributes.items() if name not in kept}
-    if hasattr(value, "__dict__"):  # a library's: its other attributes may change
+    if hasattr(value, "__dict__"):  # a library's object: its other attributes may change
         return {name: item for name, item in public.items() if _is_data(item)}
     return {} if any(base.__name__ in _RANDOM for base in kind.__mro__) else _pickled(value)
 
 
 def _is_cached(kind: type, name: str) -> bool:
-    """Whether an attribute keeps what a property has computed."""
+    """Whether an attribute is the cached value of a property."""
     return isinstance(inspect.getattr_static(kind, name, None), functools.cached_property)
 
 
 def _pickled(value: Any) -> dict[str, Any]:
-    """What pickle keeps of an object without attributes."""
+    """The name or the arguments from which pickle restores an object without attributes."""
     try:
         parts = value.__reduce_ex__(2)
-    except Exception:  # whatever such an object raises: it cannot be pickled
+    except Exception:  # an object that cannot be pickled may raise anything
         return {}
     return {"name": parts} if isinstance(parts, str) else {"arguments": parts[1]}
 
@@ -352,7 +352,7 @@ def _parameters(kinds: Iterable[type]) -> dict[str, None]:
 
 
 def _internals(kind: type) -> set[str]:
-    """Private attributes in which the project's bases of a user's class keep something, such as a count of calls."""
+    """Private attributes of a user's class that its bases in the project use, such as a count of calls."""
     bases = [base for base in kind.__mro__ if is_project(module_of(base))]
     used = {name for base in bases for name in re.findall(r"\bself\.(_\w+)", source_of(base))}
     return used - {f"_{name}" for name in _parameters(bases)}
@@ -364,7 +364,7 @@ def _slots_of(base: type) -> Iterator[str]:
 
 
 def _arguments(value: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """The attributes that have the names of the constructors' arguments; empty where one of those has no attribute."""
+    """The attributes named like the constructors' arguments; empty if an argument has no such attribute."""
     found = {}
     for name in _parameters(type(value).__mro__):
         attribute = next((attribute for attribute in (name, f"_{name}") if attribute in attributes), None)
@@ -376,6 +376,6 @@ def _arguments(value: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_projects(item: Any) -> bool:
-    """Whether a global is an object that was imported from the project, as `TASKS` is. Values count for themselves."""
+    """Whether a global is an object of a module of the project, such as `TASKS`. Plain values are not."""
     modules = [module for name, module in list(sys.modules.items()) if is_project(name)]
     return not _is_plain(item) and any(item is value for module in modules for value in vars(module).values())

@@ -30,14 +30,14 @@ def replace_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
 
 
 def user_path(text: str | Path) -> Path:
-    """The path that a user means: a leading ~ is their home, ~name that of another user, if there is one."""
+    """The path that a user means: a leading ~ is their home, ~name the home of another user, if there is one."""
     return Path(os.path.expanduser(text))  # Path.expanduser raises RuntimeError for an unknown name
 
 
 def _sync_folder(path: Path) -> None:
     try:
         folder = os.open(path, os.O_RDONLY)
-    except PermissionError:  # one may write into it and not list it
+    except PermissionError:  # a folder can be writable but not readable
         return
     try:
         _sync(folder)
@@ -46,7 +46,7 @@ def _sync_folder(path: Path) -> None:
 
 
 def _sync(descriptor: int) -> None:
-    """Wait until the content is on disk, where the file system can tell. Some cannot, of folders or at all."""
+    """Wait until the content is on disk. Some file systems cannot do that, for folders or at all: then do not wait."""
     try:
         os.fsync(descriptor)
     except OSError as error:

@@ -2,23 +2,23 @@
 
     results/<task>/<variant>/seed=<n>/
         config.yaml      the resolved configuration
-        definition.json  what the task and the algorithm stood for, as text; see store/definition.py
+        definition.json  the definitions of the task and the algorithm as text; see store/definition.py
         info.json        versions, git commit, machine, threads, the command that ran, the words of the cell, the user's
                          own sources with their checksums, start time; again for each resumption
-        evaluations.csv  step,return_mean,return_1,...,return_k,seconds: one row an evaluation, appended
+        evaluations.csv  step,return_mean,return_1,...,return_k,seconds: one row per evaluation, appended
         training.csv     step, the algorithm's own measures (losses, entropy, ...), and those of core/suggestions.py
         best.pt last.pt  state dicts
         result.json      the final evaluation; written last, so its presence means that the run is finished
-        failed.json      instead of result.json if the run diverged: the step, what was not finite, last evaluation,
-                         and as `result` the final evaluation of the best parameters before, where there are any
+        failed.json      instead of result.json if the run diverged: the step, the reason as `quantity`, the last
+                         finite evaluation, and as `result` the final evaluation of the best parameters, if any
         checkpoint/      while the run is unfinished: see store/checkpoint.py (tensorboard/, wandb/: store/loggers.py)
     results/<task>/<variant>/seed=<n>.lock
                          while a process trains the run: its process id, host and Slurm job; see store/lock.py
     results/sweep/       logs and records of sweeps: see sweep/cells.py (results/flows/: see sweep/flows.py)
 
 `<variant>` is the algorithm's name followed by `,key=value` for each setting that differs from the paper's
-(`DPre+`, `SRad,learning_starts=10000,steps=50000`). Where that is longer than a file system allows, the folder is
-called `SRad,settings=<checksum>`, and config.yaml has the whole text as `variant`. Folders moved aside are called
+(`DPre+`, `SRad,learning_starts=10000,steps=50000`). If that is longer than a file system allows, the folder is called
+`SRad,settings=<checksum>`, and config.yaml has the whole text as `variant`. Folders moved aside are called
 `seed=<n>.old-<i>`; readers ignore them, and nothing here deletes a run.
 """
 
@@ -40,7 +40,7 @@ from store.files import one_line, user_path
 from store.info import read_info
 
 LONGEST_NAME = 255
-"""Bytes in the name of a folder, at most."""
+"""The most bytes in the name of a folder."""
 # libyaml's loader is some ten times faster, which matters for two thousand runs. Not every wheel has it.
 _YamlLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -55,7 +55,7 @@ def variant_name(algo: str, overrides: Mapping[str, Any]) -> str:
 
 
 def variant_folder(variant: str) -> str:
-    """The folder of `variant`: its name, or where that is too long for a file system, a short name with a checksum."""
+    """The folder of `variant`: its name, or, if that is too long for a file system, a short name with a checksum."""
     if len(os.fsencode(variant)) <= LONGEST_NAME:
         return variant
     digest = hashlib.sha256(variant.encode()).hexdigest()[:12]
@@ -110,7 +110,7 @@ def read_settings(folder: str | Path) -> dict[str, Any]:
 
 
 def read_definition(folder: str | Path) -> dict[str, dict[str, str]] | None:
-    """The definition of the task and of the algorithm in the run in `folder`; None where it has none."""
+    """The definitions of the task and the algorithm of the run in `folder`; None if it has none."""
     try:
         content = _parse(Path(folder, "definition.json"), json.loads)
         parts = {part: content[part].items() for part in ("task", "algorithm")}
@@ -120,7 +120,7 @@ def read_definition(folder: str | Path) -> dict[str, dict[str, str]] | None:
 
 
 def lockstep_group(folder: str | Path) -> tuple[int, ...]:
-    """The seeds that the run in `folder` started with, from its info.json; empty if they are not there."""
+    """The seeds that the run in `folder` started with, from its info.json; empty if they are unknown."""
     try:
         return tuple(read_info(folder)["lockstep"])
     except (KeyError, TypeError):
@@ -149,7 +149,7 @@ class Run:
     config: dict[str, Any]
     evaluations: Evaluations
     training: dict[str, np.ndarray]
-    """Columns of training.csv, each (m,), the first called `step`; empty where the run has none."""
+    """Columns of training.csv, each (m,), the first called `step`; empty if the run has none."""
     result: dict[str, Any] | None
     failure: dict[str, Any] | None = None  # of a run that diverged: step, quantity, ...
 

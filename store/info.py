@@ -1,4 +1,4 @@
-"""What info.json of a run tells a reader: when the run started, and on which files of the user's own."""
+"""Reads a run's info.json, which also lists the user's files that may define its algorithm or task."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def read_info(folder: str | Path) -> dict[str, Any]:
 
 
 def missing_plugin(folder: str | Path) -> str:
-    """The end of a message that does not know the algorithm or the task of a run: the files that may define it.
+    """The end of an error message for an unknown algorithm or task of a run: the user's files that may define it.
 
-    Empty where the run used no file of the user's own.
+    Empty if the run used no file of the user.
     """
     try:
         files = [source["file"] for source in read_info(folder).get("sources", [])]

@@ -10,11 +10,11 @@ from types import FrameType
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 """Ctrl-C, `kill`, a terminal that closes, and the signals that batch systems can send before a job's time limit."""
 SAME_EVENT = 1.0
-"""Seconds after the first signal in which others belong to it: `timeout` and shells send theirs twice."""
+"""Signals within this many seconds of the first one belong to it: `timeout` and shells send theirs twice."""
 
 
 class Interrupted(Exception):
-    """A signal asked for the end; `signum` is its number."""
+    """A signal asked the process to stop. `signum` is its number."""
 
     def __init__(self, signum: int):
         super().__init__(f"interrupted by {signal.Signals(signum).name}")
@@ -22,11 +22,11 @@ class Interrupted(Exception):
 
 
 class Interrupts:
-    """While this context is open, the first of SIGNALS is only noted; `stop_if_asked` then raises Interrupted.
+    """While this context is open, the first of SIGNALS is only recorded; `stop_if_asked` then raises Interrupted.
 
-    A second signal has its usual effect: it ends the process at once. That does not hold for signals within SAME_EVENT
-    of the first, and for SIGHUP, which a closing terminal repeats. In a thread other than the main one, where Python
-    allows no handlers, signals keep their usual effect.
+    A second signal has its usual effect: it ends the process at once. It is ignored within SAME_EVENT of the first one,
+    and if it is SIGHUP, which a closing terminal repeats. In a thread other than the main one, where Python allows no
+    handlers, signals keep their usual effect.
     """
 
     def __init__(self) -> None:
@@ -37,7 +37,7 @@ class Interrupts:
     def __enter__(self) -> Interrupts:
         if threading.current_thread() is threading.main_thread():
             for signum in SIGNALS:
-                # A process that a script starts in the background may have to ignore SIGINT.
+                # A script may start a process in the background with SIGINT ignored, and it stays ignored.
                 if signal.getsignal(signum) is not signal.SIG_IGN:
                     self._previous[signum] = signal.signal(signum, self._note)
         return self

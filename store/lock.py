@@ -1,4 +1,4 @@
-"""One process for each run: a lock that ends with its owner and names the owner to others."""
+"""A lock that lets only one process train a run. It ends with its owner and names the owner to other processes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def run_lock(run_folder: Path) -> Iterator[None]:
 
 
 def lock_owner(run_folder: Path) -> str | None:
-    """The process that trains the run, from its lock file; None if there is none. Does not touch the lock."""
+    """The process that trains the run, from its lock file; None if no process does. Does not touch the lock."""
     try:
         owner = _parse(run_folder.with_name(run_folder.name + ".lock").read_bytes())
     except OSError:
@@ -117,4 +117,4 @@ def _is_alive(pid: int) -> bool:
         return False
     except PermissionError:
         return True
-    return pid != os.getpid()  # our own number: the owner was a process of an earlier container
+    return pid != os.getpid()  # our own process id: the owner was a process of an earlier container

@@ -1,12 +1,12 @@
-"""Where a run's numbers go beside its own files: TensorBoard and Weights & Biases.
+"""Loggers that receive a run's numbers besides its own files: TensorBoard and Weights & Biases.
 
     results/<task>/<variant>/seed=<n>/
         tensorboard/     event files, one more for each resumption
-        wandb/           what Weights & Biases keeps, with WANDB_MODE=offline the whole run
-        wandb-id.txt     its id of the run; a resumption has the same
+        wandb/           files of Weights & Biases; with WANDB_MODE=offline, the whole run
+        wandb-id.txt     the run's id at Weights & Biases, which a resumption uses again
 
-The trainer tells a run's numbers to its writer (store/writer.py), and the writer tells the loggers. Nothing comes back.
-A logger that fails is named once and left out, and the training goes on.
+The trainer passes a run's numbers to its writer (store/writer.py), which passes them to the loggers. Loggers return
+nothing. A logger that fails is reported once and left out, and the training continues.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class LoggerError(Exception):
 
 
 class Logger(Protocol):
-    """Takes the numbers of one run; steps never descend. It may raise any error."""
+    """Logs the numbers of one run. Steps never decrease. A method may raise any error."""
 
     @staticmethod
     def check() -> None:
@@ -44,9 +44,9 @@ class Logger(Protocol):
 
 
 class TensorBoard:
-    """Writes event files. Those of an earlier process count below `first_step` only.
+    """Writes event files. TensorBoard hides events of earlier processes from `first_step` on.
 
-    PyTorch writes them with the package `tensorboard`, which also shows them.
+    PyTorch writes the files with the package `tensorboard`, which also shows them.
     """
 
     @staticmethod
@@ -68,14 +68,14 @@ class TensorBoard:
 
 
 class WeightsAndBiases:
-    """Logs a run of its own for each seed. Steps that it has already are ignored by Weights & Biases itself."""
+    """Logs each seed as a separate run. Weights & Biases itself ignores steps that it already has."""
 
     @staticmethod
     def check() -> None:
         import wandb
 
         try:
-            wandb.login()  # asks for the key in a terminal: now, and not in the middle of the training
+            wandb.login()  # may ask for the key in a terminal: before the training, not during it
         except wandb.Error as error:
             raise LoggerError(f"log=wandb: {one_line(error)} (WANDB_MODE=offline needs no login)") from error
 
@@ -94,7 +94,7 @@ class WeightsAndBiases:
             group=f"{task} {variant}",
             config=dict(config),
             dir=folder,
-            reinit="create_new",  # the seeds of a process have a run each, at the same time
+            reinit="create_new",  # several runs of one process are open together, one per seed
             settings=wandb.Settings(console="off", silent=True),
         )
 
@@ -106,11 +106,12 @@ class WeightsAndBiases:
 
 
 LOGGERS: dict[str, Any] = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}
-"""By the name of the package and in `log`: made with folder, settings and first step of a run."""
+"""Logger classes by the name of their package, which is also their name in `log`. The constructor takes the folder, the
+settings and the first step of a run."""
 
 
 def logger_names(text: str) -> list[str]:
-    """The loggers that a value of `log` asks for, without the run's own files; text like `csv,wandb`."""
+    """The names of the loggers in a value of `log`, such as `csv,wandb`, without `csv`."""
     return [name for name in dict.fromkeys(text.split(",")) if name != CSV]
 
 
@@ -134,17 +135,17 @@ class Loggers:
         self.last = 0, 0.0  # step and seconds of the last evaluation
 
     def go_on_after(self, step: int) -> None:
-        """The run resumes; its last evaluation was at `step`."""
+        """Continue the run after its last evaluation, which was at `step`."""
         self.first_step, self.last = step + 1, (step, math.nan)
 
     def log_evaluation(self, step: int, mean: float, seconds: float) -> None:
-        """Log the mean return of an evaluation, and the rate since the one before in this process.
+        """Log the mean return of an evaluation, and the speed since the previous evaluation in this process.
 
-        `seconds` are those of the training since its start.
+        `seconds` is the duration of the training so far.
         """
         before, self.last = self.last, (step, seconds)
         values = {"evaluation/return": mean}
-        if seconds > before[1]:  # not for the first one of a resumption
+        if seconds > before[1]:  # not for the first evaluation after a resumption
             values["speed/steps_per_second"] = (step - before[0]) / (seconds - before[1])
         self._log(step, values)
 
@@ -166,7 +167,7 @@ class Loggers:
                 self._give_up(name, error)
 
     def close(self) -> None:
-        """Let every logger finish."""
+        """Close every logger."""
         for name in list(self.open):
             try:
                 self.open.pop(name).close()

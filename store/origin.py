@@ -1,4 +1,4 @@
-"""Whose code a module or a file is: the project's, a library's, or the user's."""
+"""Tells whether a module or a file belongs to the project, to a library or to the user."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 _INTERPRETER = {"sitecustomize", "usercustomize"}
-"""Modules that set an interpreter up."""
+"""Modules that configure the interpreter at its start."""
 _PROJECT = {"algos", "bench", "constraints", "core", "envs", "plot", "plots", "run", "store", "sweep", "tables"}
 
 
@@ -24,7 +24,7 @@ def is_project(module: str) -> bool:
 
 
 def user_file(module: str) -> Path | None:
-    """The source file of a loaded module that is neither the project's nor a library's; None for those two."""
+    """The source file of a loaded module of the user; None for a module of the project or of a library."""
     return None if is_project(module) else _user_path(getattr(sys.modules.get(module), "__file__", None))
 
 
@@ -40,9 +40,9 @@ def is_user_module(module: str) -> bool:
 
 
 def module_of(value: Any) -> str:
-    """The name of the module that defines a function or a class; empty if it tells none.
+    """The name of the module that defines a function or a class; empty if it is unknown.
 
-    Of a function that a decorator has made, that is the decorator's module, whatever the function says.
+    For a function made by a decorator, it is the decorator's module, even if `__module__` differs.
     """
     if isinstance(value, types.FunctionType):
         return value.__globals__.get("__name__") or ""
@@ -50,7 +50,7 @@ def module_of(value: Any) -> str:
 
 
 def is_user(value: Any) -> bool:
-    """Whether a function or a class is the user's own code. One that was typed at a prompt is, too."""
+    """Whether a function or a class is the user's own code. Code typed at a prompt is the user's too."""
     module = module_of(value)
     if is_project(module) or not module:
         return False
@@ -72,7 +72,7 @@ def project_files() -> list[Path]:
 
 
 def _user_path(file: str | None) -> Path | None:
-    """The path of a source file, if it belongs to neither a library nor the commands."""
+    """The path of a .py file that belongs to neither a library nor the commands; None for other files."""
     if not file:
         return None
     path = Path(file).resolve()

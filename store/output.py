@@ -1,7 +1,7 @@
-"""What a command prints may get lost; its work does not.
+"""Lets a command continue its work when it cannot print.
 
-A pipe may have no reader any more (`| head`, Ctrl-C under `| tee`), a terminal may be gone, a disk that takes a log may
-be full, a stream may be closed from the start, and an encoding may lack a character.
+A pipe may have lost its reader (`| head`, Ctrl-C under `| tee`), a terminal may be gone, the disk of a log may be full,
+a stream may be closed from the start, and an encoding may lack a character.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 @contextmanager
 def forgiving_output() -> Iterator[None]:
-    """While this context is open, no failure to print raises an exception. At its end, all that was printed is out."""
+    """While this context is open, no failure to print raises an exception. At its end, all output is flushed."""
     _fill_descriptors()
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = _Forgiving(sys.stdout), _Forgiving(sys.stderr)  # type: ignore[assignment]
@@ -29,7 +29,7 @@ def forgiving_output() -> Iterator[None]:
 
 
 def _fill_descriptors() -> None:
-    """Open what the shell has closed (`>&-`), because the next file opened would take its place, and get the output."""
+    """Open the descriptors that the shell has closed (`>&-`). Otherwise the next opened file would get the output."""
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
@@ -38,7 +38,7 @@ def _fill_descriptors() -> None:
 
 
 class _Forgiving:
-    """A stream whose failures are silent: after the first one, it writes nowhere."""
+    """A stream that ignores failures to write. After the first failure, it discards everything."""
 
     def __init__(self, stream: Any):
         if stream is None or getattr(stream, "closed", False):
@@ -64,7 +64,7 @@ class _Forgiving:
             self._give_up()
 
     def _give_up(self) -> None:
-        # What the buffer holds goes to the null device too; otherwise Python would fail at its own end.
+        # The text in the buffer goes to the null device too. Otherwise Python would fail at its exit.
         with suppress(OSError, ValueError):
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, self._stream.fileno())

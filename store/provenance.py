@@ -1,4 +1,4 @@
-"""Where a run comes from: versions, git commit, command and machine."""
+"""The provenance of a run: versions, git commit, command and machine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PACKAGES = ("numpy", "scipy", "gymnasium", "mujoco", "pybullet", "omegaconf")
 def describe_environment(command: Sequence[str]) -> dict[str, Any]:
     """The content of `info.json`: versions, commit, command, machine, start time, and sources that the commit lacks.
 
-    It names no path of this machine.
+    It contains no path of this machine.
     """
     # PyTorch itself names its build (+cpu, +cu130), which the metadata of a package may leave out.
     versions: dict[str, str | None] = {"python": platform.python_version(), "torch": str(torch.__version__)}
@@ -63,7 +63,7 @@ def _preloaded_libraries() -> list[str]:
 
 
 def command_line(words: Sequence[str]) -> str:
-    """The words as a shell takes them. An absolute path, alone or after `key=`, is cut to its last part."""
+    """Quote words for a shell. Absolute paths, alone or after `=` or a comma, are cut to their last part."""
     return shlex.join(re.sub(r"(^|=|,)/[^,]*/(?=[^,])", r"\1", word) for word in words)
 
 
@@ -80,7 +80,7 @@ def _untracked_modules() -> list[Path]:
 def _describe_sources(files: Sequence[Path]) -> list[dict[str, Any]]:
     """Name, checksum and commit of each of `files`, without those that the commit of this code includes.
 
-    A file that no repository has, has no commit. `dirty` tells whether it differs from its commit.
+    The commit is None for a file that is in no repository. `dirty` tells whether the file differs from its commit.
     """
     inside = [str(file) for file in files if file.is_relative_to(ROOT)]
     try:
@@ -115,6 +115,6 @@ def _git_describe(file: Path) -> str | None:
 
 
 def _git(file: Path, *arguments: str) -> str:
-    """What git says in the folder of `file`. Raises OSError or SubprocessError."""
+    """The output of git, run in the folder of `file`. Raises OSError or SubprocessError."""
     command = ["git", "-C", str(file.parent), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.strip()

@@ -1,10 +1,10 @@
 """Published runs: the runs of a task in three files that people can read, without parameters and checkpoints.
 
     docs/data/<task>/
-        runs.csv            one row a run: algo, variant, seed, state, return_mean, best_step, commit, and, as JSON,
-                            what config.yaml, info.json and result.json (or failed.json) of its folder hold
+        runs.csv            one row per run: algo, variant, seed, state, return_mean, best_step, commit, and, as JSON,
+                            the content of config.yaml, info.json and result.json (or failed.json) in its folder
         evaluations.csv.gz  algo, variant, seed, then the columns of the runs' evaluations.csv
-        training.csv.gz     algo, variant, seed, then the columns of the runs' training.csv; not there if no run has any
+        training.csv.gz     algo, variant, seed, then the columns of the runs' training.csv; missing if no run has one
 
 `variant` is the name of the run's folder in results/ (store/folder.py). `state` is "finished", "failed" for a run that
 diverged, or "stopped" for one that was not trained to its end. A run without a value in some column has an empty
@@ -33,7 +33,7 @@ from store.folder import Evaluations, Run, parse_variant
 
 RUNS, EVALUATIONS, TRAINING = "runs.csv", "evaluations.csv.gz", "training.csv.gz"
 KEY = ("algo", "variant", "seed")
-"""What tells the runs of a task apart: the first columns of each file."""
+"""The first columns of each file, which identify a run of a task."""
 
 Key = tuple[str, str, int]
 T = TypeVar("T")
@@ -90,7 +90,7 @@ def read_published(
 
 
 def write_published(folder: str | Path, runs: Iterable[PublishedRun]) -> None:
-    """Replace the files in `folder`, which is that of a task, by those of `runs`."""
+    """Replace the files in a task's `folder` by the files of `runs`."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     runs = sorted(runs, key=lambda run: run.key)
@@ -149,7 +149,7 @@ def _read_task(folder: Path) -> list[PublishedRun]:
 
 @contextmanager
 def _named(place: str) -> Iterator[None]:
-    """Raise what a corrupt file causes as a ValueError that names the place."""
+    """Turn an error that a corrupt file causes into a ValueError that names the `place`."""
     try:
         yield
     except KeyError as error:
@@ -163,14 +163,14 @@ def _key(row: Mapping[str, str]) -> Key:
 
 
 def _by_run(path: Path, parse: Callable[[list[dict[str, str]]], T]) -> dict[Key, T]:
-    """What `parse` makes of the rows of each run in the file `path`; no runs if there is no such file."""
+    """Apply `parse` to the rows of each run in the file `path`. Without such a file, there are no runs."""
     rows = _read_table(path) if path.exists() else []
     with _named(str(path)):
         return {key: parse(list(group)) for key, group in groupby(rows, _key)}
 
 
 def _columns(rows: Sequence[Mapping[str, str]]) -> dict[str, np.ndarray]:
-    """The columns of a run's rows that are not empty, without the key."""
+    """The columns of a run's rows, without `KEY` and columns that are empty in the first row."""
     names = [name for name, text in rows[0].items() if text and name not in KEY] if rows else []
     return {name: np.array([float(row[name]) for row in rows]) for name in names}
 
@@ -203,7 +203,7 @@ def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     writer.writeheader()
     writer.writerows({name: _text(value) for name, value in row.items()} for row in rows)
     content = text.getvalue().encode()
-    # Without a time in the header, the same runs make the same file.
+    # Without a time in the header, the same runs give the same file.
     replace_file(path, lambda file: file.write(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content))
 
 

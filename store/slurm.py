@@ -1,4 +1,4 @@
-"""Questions to Slurm: the job that this process belongs to, and the jobs in the queue."""
+"""Queries to Slurm: the job that this process belongs to, and the jobs in the queue."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ENDED = {
 
 
 def cluster() -> str:
-    """The name of the cluster that Slurm's programs ask here; empty if it is unknown."""
+    """The name of the cluster that Slurm's programs query here; empty if it is unknown."""
     # The first variable redirects Slurm's programs; Slurm sets the second one on its nodes.
     if name := os.environ.get("SLURM_CLUSTERS") or os.environ.get("SLURM_CLUSTER_NAME"):
         return name
@@ -45,9 +45,9 @@ def current_job() -> dict[str, Any] | None:
 
 
 def queue(jobs: Iterable[str], timeout: float = 60.0) -> dict[str, str] | None:
-    """The state (PENDING, RUNNING, ...) of those of `jobs` that have not ended, by id, an array's as `<id>_<task>`.
+    """The states (PENDING, RUNNING, ...), by id, of the `jobs` that have not ended. A job of an array is `<id>_<task>`.
 
-    None if Slurm cannot be asked or does not answer within `timeout` seconds.
+    None if Slurm cannot be queried or does not answer within `timeout` seconds.
     """
     jobs = set(jobs)
     arrays = sorted({job.partition("_")[0] for job in jobs})

@@ -1,4 +1,4 @@
-"""The source of functions and classes as text that stays the same while they do the same."""
+"""The source of functions and classes as text without comments, docstrings and blank lines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any
 
 
 def _codes(code: types.CodeType) -> Iterator[types.CodeType]:
-    """A function's code and that of the functions in it."""
+    """The code of a function and of the functions inside it."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
@@ -26,7 +26,7 @@ def _codes(code: types.CodeType) -> Iterator[types.CodeType]:
 
 
 def names_in(code: types.CodeType) -> set[str]:
-    """The names that a function uses, also those in functions inside it."""
+    """The names that a function and the functions inside it use."""
     return {name for each in _codes(code) for name in each.co_names}
 
 
@@ -37,24 +37,25 @@ def imports_in(code: types.CodeType) -> set[str]:
 
 
 def source_of(value: types.FunctionType | type) -> str:
-    """The source of a function or a class without comments, docstrings and blank lines; empty where there is none."""
+    """The source of a function or a class without comments, docstrings and blank lines; empty if there is none."""
     try:
         if value.__name__ == "<lambda>":
             return _lambda_source(value)
-        # The code of a function that a decorator has made is the decorator's, its own source that of the decorated.
+        # For a function made by a decorator, `__code__` leads to the source of the wrapper, and the function itself to
+        # the source of the decorated function.
         return _bare(textwrap.dedent(inspect.getsource(getattr(value, "__code__", value))))
     except (OSError, TypeError, SyntaxError, IndentationError, tokenize.TokenError):
         return ""
 
 
 def _lambda_source(function: Any) -> str:
-    """The source of `function`, a lambda, among those that start in its line."""
+    """The source of the lambda `function`, or of all lambdas that start in its line if none of them matches."""
     code = function.__code__
     text = "".join(linecache.getlines(code.co_filename, function.__globals__))
     nodes = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Lambda)]
     nodes = [node for node in nodes if node.lineno == code.co_firstlineno]
     segments = {ast.get_source_segment(text, node) or "": node for node in nodes}
-    # Of a lambda in a lambda, the places of its code are in both.
+    # The code of a lambda inside a lambda matches both. The shorter source is the right one.
     alike = sorted((segment for segment, node in segments.items() if _is_source_of(segment, node, code)), key=len)
     return "\n".join(" ".join(segment.split()) for segment in alike[:1] or segments)
 
@@ -65,7 +66,7 @@ def _is_source_of(segment: str, node: ast.Lambda, code: types.CodeType) -> bool:
         first, last = (body.lineno, body.col_offset), (body.end_lineno, body.end_col_offset)
         inside = [first <= (place[0], place[2]) and (place[1], place[3]) <= last for place in places]
         return bool(places) and all(inside)
-    variables = ", ".join(code.co_freevars)  # of the function around it
+    variables = ", ".join(code.co_freevars)  # variables of the function around it
     inner = list(_codes(compile(f"def _({variables}): return ({segment})", "", "exec")))[2]
     parts = ("co_code", "co_names", "co_varnames", "co_freevars", "co_consts")
     return all(getattr(inner, part) == getattr(code, part) for part in parts)
@@ -86,7 +87,7 @@ def _bare(source: str) -> str:
 
 
 def without_source(code: types.CodeType) -> str:
-    """What is known of a function that was typed at a prompt."""
+    """Describe a function without a source, such as one typed at a prompt, by its constants, names and bytecode."""
     constants = [without_source(c) if isinstance(c, types.CodeType) else _constant(c) for c in code.co_consts]
     said = f"without a source; constants {', '.join(constants)}; names {', '.join(sorted(code.co_names))}"
     version = ".".join(platform.python_version_tuple()[:2])

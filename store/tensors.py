@@ -1,4 +1,4 @@
-"""Files of tensors that notice damage: a line with a checksum, then what `torch.save` writes."""
+"""Files of tensors with a checksum, so that damage is noticed: a line with the SHA-256, then a `torch.save`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from store.files import replace_file
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
-    """Replace the file `path`, as `replace_file` does. Raises OSError."""
+    """Replace the file `path` by `content`, as `replace_file` does. Raises OSError."""
     body = io.BytesIO()
     torch.save(dict(content), body)
     digest = hashlib.sha256(body.getbuffer()).hexdigest().encode() + b"\n"
@@ -22,7 +22,7 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def load_tensors(path: Path) -> dict[str, Any]:
-    """What `save_tensors` has written. Raises ValueError for another content, OSError where it cannot be read."""
+    """Read what `save_tensors` wrote. Raises ValueError for a wrong checksum, OSError for an unreadable file."""
     with open(path, "rb") as file:
         digest = file.readline(100).rstrip(b"\n").decode("ascii", "replace")
         body = io.BytesIO(file.read())

@@ -1,4 +1,4 @@
-"""Writes the folder of one run while it trains. store/folder.py says what is in it."""
+"""Writes the folder of one run while it trains. store/folder.py describes the files in it."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ TABLES = ("evaluations.csv", "training.csv")
 
 
 class RunWriter:
-    """Writes the folder of one run, one seed.
+    """Writes the folder of one run, that is, of one seed.
 
-    An existing folder is moved aside to `<folder>.old-<i>`. For a finished run, that takes `replace_finished`;
-    otherwise it raises FileExistsError. `resume` continues an unfinished run instead.
+    An existing folder is moved aside to `<folder>.old-<i>`. If it holds a finished run, FileExistsError is raised
+    unless `replace_finished` is true. `resume` continues an unfinished run instead.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class RunWriter:
         return {"step": int(evaluations.step[last]), "return_mean": float(evaluations.return_mean[last])}
 
     def _append(self, name: str, row: Sequence[str]) -> None:
-        # One write for one line: a simultaneous reader sees it whole, or without its line end.
+        # One write per line: a simultaneous reader sees the whole line, or a part of it without the line end.
         path = self.folder / name
         try:
             with open(path, "a") as file:

@@ -3,9 +3,9 @@
     python bench/checkpoint.py                                               # HC+O, a million transitions
     python bench/checkpoint.py seeds=4 env=R+L2 transitions=2e5 folder=DIR   # DIR: on the disk to be measured
 
-Each seed's buffer has `transitions` synthetic transitions, because only their size matters. Prints for each number of
-seeds in lockstep: time and bytes of a checkpoint after `checkpoint_every` steps, and of one that writes the whole
-buffer; the time of resuming; the additional memory for writing; and the checkpoint's share of the training time,
+Each seed's buffer has `transitions` transitions. They are synthetic, because only their size matters. Prints for each
+number of seeds in lockstep: time and bytes of a checkpoint after `checkpoint_every` steps, and of one that writes the
+whole buffer; the time of resuming; the additional memory for writing; and the checkpoint's share of the training time,
 estimated from the time of a gradient step.
 """
 

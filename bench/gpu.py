@@ -12,7 +12,7 @@ The parts run in this order. Each result is saved at once, so that an early end 
   and HC+O, beside the floor (the same matrix products and nothing else, as a CUDA graph) and, for one seed, beside
   eager PyTorch in CleanRL's style (bench/eager.py); CPU time of the thread that launches them; GPU memory;
 - `agreement`: the difference between parameters on the GPU and on the CPU over the first 200 updates, all 13
-  algorithms, beside the difference that one rounding of the initial parameters makes on the CPU;
+  algorithms, and for comparison the difference that a rounding of the initial parameters causes on the CPU;
 - `runs`: steps a second of whole runs, environment included, and the phases of a step of all seeds;
 - `cells`: full-length cells of R+L2, the algorithms `cells` with the seeds `cell_seeds`, a process for each algorithm,
   until the time is over. Their folders are in `out`/runs. They write a checkpoint only when the time is over; the same

@@ -63,7 +63,7 @@ def memory_of(device: torch.device) -> Iterator[Callable[[], float | str]]:
     """Yield a function that returns the peak GPU memory since the start, in megabytes ("" on a CPU)."""
     on_gpu = device.type == "cuda"
     if on_gpu:
-        gc.collect()  # agents and their graphs are reference cycles
+        gc.collect()  # agents and their graphs form reference cycles
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
     yield lambda: torch.cuda.max_memory_allocated(device) / 1e6 if on_gpu else ""

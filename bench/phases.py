@@ -59,7 +59,7 @@ class Stopwatch:
         self.calls: dict[str, list[float]] = defaultdict(list)
 
     def watch(self, owner: Any, name: str, phase: str) -> Any:
-        """A context manager that counts calls of `owner.name` for `phase`."""
+        """A context manager that times the calls of `owner.name` and assigns them to `phase`."""
         inner = getattr(owner, name)
 
         def timed(*arguments, **options):

@@ -39,10 +39,10 @@ PAUSE = 0.5
 
 
 def take_steps(options: dict[str, str], number: int, processes: list[int]) -> None:
-    """Measure as process `number`: print its single-seed updates a second for each of the counts `processes`.
+    """Measure as process `number`: print its single-seed updates a second for each number in `processes`.
 
-    With `number` processes or fewer, it does nothing and prints 0. The process prints a line when it is ready, reads a
-    time (seconds since the epoch) from stdin, and starts then.
+    It pauses and prints 0 where only `number` processes or fewer take part. The process prints a line when it is ready,
+    reads a time (seconds since the epoch) from stdin, and starts then.
     """
     torch.set_num_threads(1)
     seeds, seconds = (whole_number(key, options[key]) for key in ("seeds", "seconds"))

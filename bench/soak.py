@@ -81,7 +81,7 @@ class Soak:
         return torch.where(self.chance(0.1, n, 1) & beside.isfinite(), beside, suggested)
 
     def mapped(self, name: str, obs: Tensor, suggested: Tensor) -> Tensor:
-        """The map `name` of suggestions (n, d). The gauge map's are clamped to the box first, as agents do."""
+        """Apply the map `name` to suggestions (n, d). For the gauge map, clamp them to the box first, as agents do."""
         if name == "gauge_map":
             suggested = suggested.clamp(-1.0, 1.0)
         return getattr(self.constraint, name)(obs, suggested)

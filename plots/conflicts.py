@@ -19,7 +19,7 @@ def keep_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     """Separate runs whose task or algorithm has several definitions; return all runs and a line for each conflict.
 
     Such a run gets one more setting, `task_definition` or `algorithm_definition`, which separates it in all tables and
-    figures. A run without a stored definition predates this feature. It conflicts only with a user's own definition.
+    figures. A run without a stored definition is older than this feature. It conflicts only with a user's definition.
     """
     definitions = [read_definition(run.folder) for run in runs]
     extra: list[dict[str, str]] = [{} for _ in runs]

@@ -73,7 +73,7 @@ def plain(axes: Axes) -> None:
 
 
 def save(figure: Figure, folder: Path, name: str, formats: Sequence[str]) -> list[Path]:
-    """Save as `folder/name` in those of `formats` that are image formats, and return the files.
+    """Save as `folder/name` in all image formats among `formats`, and return the files.
 
     Characters that are awkward in a file name become _. A name that is too long is cut and gets a checksum.
     """

@@ -256,7 +256,7 @@ def test_tables_go_back_to_what_a_checkpoint_holds(tmp_path):
     assert writer.tables()["training.csv"] == tables["training.csv"] + "20,0.2,nan\n"
     assert writer.last_finite_evaluation() == {"step": 10, "return_mean": 2.0}
 
-    (tmp_path / "seed=1" / "info.json").write_text("{")  # for people only: no code depends on it
+    (tmp_path / "seed=1" / "info.json").write_text("{")  # for people: resuming does not need it
     again = RunWriter.resume(tmp_path / "seed=1", {"tau": 0.5}, {"commit": "b"}, eval_episodes=2)
     again.restore_tables(tables)
     assert again.tables() == tables and results.read_run(again.folder).config == {"tau": 0.5}

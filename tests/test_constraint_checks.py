@@ -1,4 +1,4 @@
-"""Wrong coefficients, centres and arguments of the closed forms: one line says what is wrong; no garbage returns."""
+"""Wrong coefficients, centres and arguments of the closed forms: an error of one line, never a wrong result."""
 
 import copy
 import math

@@ -165,7 +165,7 @@ def test_bounds_that_are_functions_of_the_observation(name):
     """Each sample has its own bound, in every method and in the explicit form."""
     largest, build, _ = FAMILIES[name]
     if name == "box":
-        return  # it has no bound
+        return  # this set has no bound
     dim = min(largest, 4)
     generator = torch.Generator().manual_seed(0)
     obs, action = (torch.randn(3, n, generator=generator).double() for n in (2 * dim, dim))

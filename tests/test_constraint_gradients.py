@@ -154,7 +154,7 @@ def test_densities(name):
     assert_gradients(lambda o, a: constraint.gauge_log_prob(o, a, a.sum(-1)), theta, obs, inside)
 
 
-# ------------------------------------------------------------------------------------------ where there are none
+# ------------------------------------------------------------------------------------------ no gradients
 
 
 def general(learned: Tensor) -> dict[str, Constraint]:

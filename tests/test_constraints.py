@@ -89,7 +89,7 @@ def test_center_is_chebyshev_s_or_the_origin(task):
 @pytest.mark.parametrize(
     "w, s, gradient",
     [
-        ([2.0, 1.0], [1.0, 1.0], [0.2, 0.1]),  # the ellipse holds the oracle, the row does not
+        ([2.0, 1.0], [1.0, 1.0], [0.2, 0.1]),  # the ellipse limits the oracle, the row does not
         ([1.5, 3.0], [0.0, 3.0], [0.15, 0.3]),  # the ellipse does not limit the first coordinate
         ([1.3125, 3.0], [1.0, 1.0], [0.13125, 0.3]),  # the ratios are equal up to rounding
         ([1.0, 1.0], [0.0, 1.0], [0.1, 0.1]),

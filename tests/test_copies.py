@@ -140,7 +140,7 @@ def test_a_copied_environment_goes_on_bit_for_bit(task, state, way, own_tasks):
     same(answers(middle, np.random.default_rng(0), 60), expected)  # the copies did not disturb each other
 
 
-@pytest.mark.parametrize("way", [*WAYS.values()][:3], ids=[*WAYS][:3])  # a shallow copy of a wrapper wraps the same
+@pytest.mark.parametrize("way", [*WAYS.values()][:3], ids=[*WAYS][:3])  # a shallow copy would wrap the same env
 @pytest.mark.parametrize("options", [{}, {"max_episode_steps": 20}])
 @pytest.mark.parametrize("task", ["R-T", "W-M"])
 def test_through_gymnasiums_wrappers(task, options, way):

@@ -492,7 +492,7 @@ def test_no_opengl_backend_is_a_clear_error(monkeypatch):
     monkeypatch.setattr("ctypes.util.find_library", lambda library: None)
     with pytest.raises(RuntimeError, match="libegl1 or libosmesa6"):
         env.render()
-    env.step(np.zeros(3))  # training goes on
+    env.step(np.zeros(3))  # training continues
     env.close()
 
 

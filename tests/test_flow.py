@@ -220,7 +220,7 @@ def test_agents_do_not_share_the_map_of_the_table():
     assert all(torch.equal(agents[1].map.state()[name], value) for name, value in agents[0].map.state().items())
 
 
-# ---------------------------------------------------------------- what a set depends on
+# ---------------------------------------------------------------- features of a set
 
 
 def test_features_are_what_the_set_depends_on():

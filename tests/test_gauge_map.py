@@ -47,7 +47,7 @@ def centers(task: Task, obs: Tensor) -> list[Tensor | None]:
     return [None, interior_point(task, obs, 5)]
 
 
-# ---------------------------------------------------------------- where the map goes
+# ---------------------------------------------------------------- the image of the map
 
 
 @every_task

@@ -127,7 +127,7 @@ def test_several_centres_for_one_action():
 
 
 def test_a_small_turn_is_a_small_step():
-    """The radial map of one action moves with the slab, as its projection does."""
+    """If the slab turns a little, the image of an action under every map moves only a little."""
     rows, bounds = both_sides(torch.stack((turning(2, 0.01)[1] * 0.5**0.5).unbind(), 0), -0.1, 0.1)
     slab_ = fixed(rows, bounds)
     action = torch.tensor([0.4, -0.9], dtype=torch.float64).expand(2, 2)

@@ -58,7 +58,7 @@ CASES = {
     "SAC with gSDE": ("SRad", "R+M"),
     "NFWPO": ("NFW", "R+L2"),
     # (Much longer runs differ: contact amplifies a rounding error by a factor of ten in some twenty steps.)
-    # Untrained walkers fall after 10 to 50 steps, each seed at times of its own; updates come once an episode.
+    # Untrained walkers fall after 10 to 50 steps, each seed at other times; updates come once an episode.
     "TD3 on Walker2d": ("DAlpha", "W+M"),
     "SAC on Walker2d": ("SAlpha", "W+O+S"),
     "SAC with stored centres": ("SRad", "W+M"),

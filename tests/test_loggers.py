@@ -127,7 +127,7 @@ except ZeroDivisionError:
             repr(read_run(folder).evaluations.return_mean[-1]).removeprefix("np.float64(").rstrip(")").encode() in kept
         )
         names.add(name)
-    assert len(names) == 2  # the seeds are runs of their own
+    assert len(names) == 2  # each seed is a run
 
 
 @pytest.mark.parametrize("name, module", [("tensorboard", "torch.utils.tensorboard"), ("wandb", "wandb")])

@@ -207,7 +207,7 @@ def test_maps_stand_only_where_random_actions_and_suggestions_fit(map):
         assert map.squashes and torch.equal(map(CONSTRAINT, obs, action, None), pulled_back)
 
 
-# ---------------------------------------------------------------- a map and an algorithm of one's own
+# ---------------------------------------------------------------- a user's own map and algorithm
 
 
 @pytest.mark.parametrize("agent", [TD3, SAC])

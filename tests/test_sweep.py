@@ -461,7 +461,7 @@ def test_status_of_what_is_no_folder_of_results(tmp_path, monkeypatch, capsys, w
     assert err.startswith("run.py: ") and err.count("\n") == 1
 
 
-# ---------------------------------------------------------------- Slurm, where there is none
+# ---------------------------------------------------------------- without a real Slurm
 
 
 def test_jobs_that_slurm_knows(tmp_path, monkeypatch):

@@ -227,7 +227,7 @@ def test_observations_in_single_precision(dtype):
             envs.make("R+N", dtype=bad)
 
 
-# ---------------------------------------------------------------- what is where in an observation
+# ---------------------------------------------------------------- the entries of an observation
 
 
 def rows_of(robot):

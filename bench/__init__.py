@@ -1,1 +1,1 @@
-"""Benchmarks: time, memory and safety of what the other rooms do. Each file is a command, or serves several."""
+"""Benchmarks of the other packages: time, memory and safety. Each file is a command or a helper of several commands."""

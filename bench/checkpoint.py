@@ -3,10 +3,10 @@
     python bench/checkpoint.py                                               # HC+O, a million transitions
     python bench/checkpoint.py seeds=4 env=R+L2 transitions=2e5 folder=DIR   # DIR: on the disk to be measured
 
-`transitions` is the number of each seed; they are synthetic, because only their size matters. Prints for each number of
-seeds in lockstep: time and bytes of a checkpoint after `checkpoint_every` steps, and of one that writes the whole
-buffer; the time of resuming; the memory that writing needs in addition; and the checkpoint's share of the training's
-time, by a gradient step that is timed here.
+Each seed's buffer has `transitions` transitions. They are synthetic, because only their size matters. Prints for each
+number of seeds in lockstep: time and bytes of a checkpoint after `checkpoint_every` steps, and of one that writes the
+whole buffer; the time of resuming; the additional memory for writing; and the checkpoint's share of the training time,
+estimated from the time of a gradient step.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def megabytes(folder: Path) -> float:
 
 
 def peak() -> float:
-    """The most memory that this process has had so far, in megabytes."""
+    """The peak memory of this process so far, in megabytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 

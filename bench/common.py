@@ -1,4 +1,4 @@
-"""What the benchmarks of training share: configurations, agents, replay buffers with real transitions, the machine."""
+"""Helpers of the training benchmarks: configurations, agents, replay buffers with real transitions, the machine."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def machine_name(device: torch.device) -> str:
 
 
 def make_config(algo: str, **settings: object) -> Config:
-    """The paper's configuration of `algo` on the task, or on another one (`env`), with other `settings`."""
+    """The paper's configuration of `algo` with changed `settings`. The task is `TASK` unless `env` is among them."""
     words = {key: str(value) for key, value in settings.items()}
     (cell,) = make_cells({"algo": algo, "env": TASK} | words)
     return cell.config
 
 
 def make_agent(name: str, batch: int, seeds: Sequence[int], device: torch.device | str = "cpu") -> Agent:
-    """A new agent with the paper's settings for the task and another batch size."""
+    """A new agent with the paper's settings for `TASK`, except for the batch size."""
     return agent_of(make_config(name, batch_size=batch, device=device), seeds)
 
 
@@ -46,7 +46,7 @@ def agent_of(config: Config, seeds: Sequence[int]) -> Agent:
 
 
 def fill_replay(agent: Agent, transitions: int) -> Replay:
-    """A replay buffer with `transitions` steps of each of the agent's seeds, under its warm-up actions."""
+    """A replay buffer with `transitions` steps of each of the agent's seeds, taken with its warm-up actions."""
     seeds = agent.seeds
     everyone = range(len(seeds))
     replay = Replay(seeds, transitions, agent.obs_dim, agent.action_dim, agent.stores_centers, agent.device)

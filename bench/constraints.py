@@ -7,16 +7,16 @@
 Prints a table and saves it in `out` (default bench/results) as constraints.md and, one measurement a row, as
 constraints.csv.
 
-Times are CPU time, the least of several repeats. `project + gradient` is forward and backward. Velocities and angles
-are drawn so that the constraint holds the action back for a fair share, which the table gives: every entry of an
-observation is normal with standard deviation 1 on Reacher and 8 elsewhere, actions are uniform in the box. `task` takes
-the paper's tasks and the sets of `bench/own_sets.py`, such as 2x6 for two rows in six dimensions.
+Times are CPU time, the least of several repeats. `project + gradient` is the forward and the backward pass. Actions are
+uniform in the box. Every entry of an observation is normal with standard deviation 1 on Reacher and 8 elsewhere, so
+that a fair share of the actions is infeasible; the table gives this share. `task` accepts the paper's tasks and the
+sets of `bench/own_sets.py`, such as 2x6 for two rows in six dimensions.
 
-The baselines take the same numbers: `osqp` (a loop; projection on linear sets; tolerance 1e-6), `gurobi` (a loop;
-projection), `cvxpylayers` (projection and its gradient on the paper's sets, in their most compact forms), `qpth`
-(batched; the same on linear sets), `linprog` (SciPy's HiGHS, a loop; centre and oracle of linear sets). Those not
-installed are left out: `pip install -e '.[bench]'` for osqp, gurobi and cvxpylayers, `pip install --no-deps qpth` (it
-asks for numpy 1).
+The baselines get the same observations and actions: `osqp` (a loop; projection on linear sets; tolerance 1e-6),
+`gurobi` (a loop; projection), `cvxpylayers` (projection and its gradient on the paper's sets, in their most compact
+forms), `qpth` (batched; the same on linear sets), `linprog` (SciPy's HiGHS, a loop; centre and oracle of linear sets).
+Those not installed are left out: `pip install -e '.[bench]'` for osqp, gurobi and cvxpylayers,
+`pip install --no-deps qpth` (it requires numpy 1).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# This folder holds a file with the name of the package: look in the project instead.
+# This file would hide the package `constraints`: import from the project root, not from this folder.
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 import numpy as np
@@ -62,7 +62,7 @@ Operation = Callable[[Tensor, Tensor], Tensor]
 SETS = {name: task.constraint for name, task in TASKS.items()} | own_sets()
 OURS = "this package"
 BASELINES = {"osqp": 64, "gurobi": 16, "cvxpylayers": 16, "qpth": 256, "linprog": 16}
-"""The largest batch that each is measured on. Longer ones are taken to cost in proportion."""
+"""The largest batch that each solver is measured on. The time of a larger batch is extrapolated in proportion."""
 
 
 def graded(project: Operation) -> Operation:
@@ -112,7 +112,7 @@ def osqp_loop(constraint: Constraint) -> dict[str, Operation]:
             dense = np.vstack((rows, box))
             upper = np.concatenate((bounds, np.ones(dim)))
             if solver is None:
-                pattern = sparse.csc_matrix(np.ones_like(dense))  # zeros too, so that every sample has this one
+                pattern = sparse.csc_matrix(np.ones_like(dense))  # zeros included, so that all samples share it
                 pattern.data = dense.T.ravel()
                 lower = np.concatenate((np.full(len(bounds), -np.inf), -np.ones(dim)))
                 solver = osqp.OSQP()
@@ -223,7 +223,7 @@ def linprog_loop(constraint: Constraint) -> dict[str, Operation]:
         dim, solutions = constraint.dim, []
         box = np.vstack((np.eye(dim), -np.eye(dim)))
         for rows, bounds in each_row(constraint, obs):
-            # The last variable is the radius: a row of norm |A_i| keeps its distance.
+            # The last variable is the radius r of a ball around the centre: A_i c + |A_i| r <= b_i.
             sides = np.vstack((rows, box))
             sides = np.column_stack((sides, np.linalg.norm(sides, axis=1)))
             limits = np.concatenate((bounds, np.ones(2 * dim)))
@@ -258,7 +258,7 @@ def draw(task: str, batch: int) -> tuple[Tensor, Tensor]:
     """Observations (batch, n) and actions (batch, d)."""
     generator = torch.Generator().manual_seed(0)
     spread = 1.0 if task in TASKS and TASKS[task].robot is Reacher else 8.0
-    # The sets look at the first 17 entries at most.
+    # No set reads more than the first 17 entries.
     obs = torch.randn(batch, 17, generator=generator, dtype=torch.float64) * spread
     return obs, 2.0 * torch.rand(batch, SETS[task].dim, generator=generator, dtype=torch.float64) - 1.0
 
@@ -268,7 +268,7 @@ def cpu_time(call: Callable[[], Tensor], budget: float = 0.3, repeats: int = 200
     start = time.process_time()
     call()
     first = time.process_time() - start
-    if first > budget:  # what a solver or the package sets up at its first call is no cost of the call
+    if first > budget:  # the first call may include one-off setup, which must not count
         start = time.process_time()
         call()
         return min(first, time.process_time() - start)
@@ -284,7 +284,7 @@ def cpu_time(call: Callable[[], Tensor], budget: float = 0.3, repeats: int = 200
 
 
 def measure(task: str, batches: list[int], solvers: list[str]) -> list[dict]:
-    """One record for each operation, solver and batch size: CPU seconds, and from how many samples they are known."""
+    """A record for each operation, solver and batch size: CPU seconds, and the number of samples actually measured."""
     constraint = SETS[task]
     records = []
     for solver in (OURS, *solvers):
@@ -332,7 +332,7 @@ def table(records: list[dict], batches: list[int]) -> str:
 
 
 def choices(arguments: list[str]) -> tuple[list[str], list[int], list[str], Path]:
-    """Tasks, batch sizes, baselines and the folder that the `key=value` words ask for; ConfigError for a wrong one."""
+    """Parse the `key=value` words into tasks, batch sizes, baselines and folder. Raises ConfigError for a bad word."""
     known = {"task": "all", "batch": "1,16,100,256,2560", "baselines": "all", "out": "bench/results"}
     known |= parse_words(arguments, known)
     solvers = split_names("baseline", known["baselines"], BASELINES, {"none": ()})

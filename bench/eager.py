@@ -1,6 +1,6 @@
-"""TD3 and SAC for one seed as most programs write them: eager PyTorch, one operation after the other.
+"""TD3 and SAC for one seed, written as in most programs: eager PyTorch, one operation after the other.
 
-The steps are those of CleanRL's `td3_continuous_action.py` and `sac_continuous_action.py`: modules of `torch.nn`,
+The steps follow CleanRL's `td3_continuous_action.py` and `sac_continuous_action.py`: modules of `torch.nn`,
 `torch.optim.Adam`, a loop over parameters for the targets, and batches that NumPy gathers on the CPU. SAC's actor
 learns in every step, as ours does.
 """
@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from core.config import Config
 
 TRANSITIONS = 1_000
-"""In the replay buffer."""
+"""Number of transitions in the replay buffer."""
 
 
 def mlp(sizes: list[int]) -> nn.Sequential:

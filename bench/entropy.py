@@ -1,19 +1,19 @@
-"""How much entropy a policy can have on each task, beside the target that SAC steers for.
+"""The entropy that a policy can reach on each task, beside SAC's target entropy.
 
     python bench/entropy.py                                # all tasks
     python bench/entropy.py task=R+L2,R+T states=256       # two of them, at more states
 
-Prints a table and saves it in `out` (default bench/results) as entropy.md; all take some fifteen minutes. For each
-task, means over `states` that a run's warm-up visits:
+Prints a table and saves it in `out` (default bench/results) as entropy.md; all tasks take about fifteen minutes. The
+values are means over `states` states that a run's warm-up visits:
 
 - target: SAC's, -d.
 - uniform: the entropy of the uniform distribution on the feasible set, the log of its volume. No policy has more.
-- SRad, SAlpha: the most that N(mean, diag std^2) has after the map, in the measure of `entropy=paper`. Gradient ascent
-  on mean and std finds it in each state, so it is a lower bound. It is measured with noise that the ascent did not see.
+- SRad, SAlpha: the largest entropy of N(mean, diag std^2) after the map, in the measure of `entropy=paper`. Gradient
+  ascent on mean and std finds it in each state, so it is a lower bound. It is measured with new noise samples.
 - SRad ball, SAlpha ball: the same in the measure of `entropy=ball`.
 
-A target above what the map can reach makes the temperature rise without end; one just below keeps the policy as random
-as it can be.
+If the target is above the largest entropy, the temperature rises without end. If it is just below, the policy stays as
+random as possible.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import sys
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# This folder is first in the path, but the project's packages are looked for.
+# A script's own folder is first on the path; the imports below need the project root.
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 import torch
@@ -47,7 +47,7 @@ MAPS = {
 
 
 def visited_states(task: str, states: int) -> Tensor:
-    """Observations (states, n), twenty steps apart, under uniform actions that are projected."""
+    """Observations (states, n), twenty steps apart, under projected uniform actions."""
     env = envs.make(task, project=True)
     env.action_space.seed(0)
     obs, _ = env.reset(seed=0)
@@ -63,12 +63,12 @@ def visited_states(task: str, states: int) -> Tensor:
 
 
 def normal_noise(samples: int, dim: int, seed: int) -> Tensor:
-    """Standard normal numbers (samples, dim), more even than random ones."""
+    """Quasi-random standard normal numbers (samples, dim): more evenly spread than random ones."""
     return torch.as_tensor(qmc.MultivariateNormalQMC([0.0] * dim, rng=seed).random(samples))
 
 
 def uniform_entropy(constraint: Constraint, obs: Tensor) -> Tensor:
-    """Log of the set's volume in every state: the unit ball's, times the mean of reach^d over all directions."""
+    """Log-volume (states,) of the set: the unit ball's volume times the mean of reach^d over all directions."""
     dim = constraint.dim
     directions = torch.nn.functional.normalize(normal_noise(DIRECTIONS, dim, seed=0), dim=-1)
     log_reach = torch.stack([-constraint.gauge(o, directions, constraint.center(o)).log() for o in obs])
@@ -88,7 +88,7 @@ def log_density(
 
 
 def largest_entropy(constraint: Constraint, obs: Tensor, mapping: str, unit_ball: bool) -> Tensor:
-    """The most entropy in every state that a Gaussian with independent coordinates has after the map."""
+    """The largest entropy (states,) of a Gaussian with independent coordinates after the map, by gradient ascent."""
     dim, center = constraint.dim, constraint.center(obs)
     noise = normal_noise(SAMPLES, dim, seed=1).unsqueeze(1)
     reach = torch.stack([1 / constraint.gauge(obs, axis, center) for axis in torch.eye(dim).double()], -1)
@@ -99,8 +99,8 @@ def largest_entropy(constraint: Constraint, obs: Tensor, mapping: str, unit_ball
     for _ in range(ASCENT_STEPS):
         policy = Normal(mean, log_std.exp())
         action = (mean + log_std.exp() * noise).detach()
-        # The gradient of an entropy is -E[log q grad log p]. SAC's own, through the action, would miss what passes from
-        # inside to the boundary under the alpha map, where log q jumps.
+        # The gradient of the entropy is -E[log q grad log p]. SAC's gradient through the action would miss probability
+        # that moves from the interior to the boundary under the alpha map, where log q jumps.
         surprise = log_density(constraint, obs, action, policy, mapping, unit_ball)
         loss = ((surprise - surprise.mean(0)) * policy.log_prob(action).sum(-1)).mean(0).sum()
         optimizer.zero_grad()

@@ -1,11 +1,11 @@
 """The arithmetic floor of a gradient step: its matrix products and nothing else.
 
-`update_products` lists the products that the mathematics of one update needs, from the widths of the layers; `Floor`
-carries them out, each into memory that exists already. It lists only the necessary ones: in the critics' step no
-gradient of their input; in the actor's step no gradient of the critics' weights, of the state, or of the actor's input.
-Everything else costs nothing here: biases, activations, losses, noise, sampling, optimiser, targets.
+`update_products` lists the products that one update needs, from the widths of the layers. `Floor` computes them in
+preallocated memory. Only the necessary products are listed: the critics' step needs no gradient of the critics' input;
+the actor's step needs no gradient of the critics' weights, of the state, or of the actor's input. Everything else is
+left out: biases, activations, losses, noise, sampling, optimiser, targets.
 
-Names of matrices: `x0` is what a network is given, `x1` what its first layer returns, `g1` the gradient of that;
+Names of matrices: `x0` is the input of a network, `x1` the output of its first layer, and `g1` the gradient of `x1`;
 `w0` and `dw0` are the weights of its first layer and their gradient.
 """
 
@@ -24,7 +24,7 @@ from core.config import Config
 class Product:
     """`out` (rows, m, n) = `left` (rows, m, k) times `right` (rows, k, n).
 
-    A name that ends in `.T` is the transpose of the matrix with the name before.
+    A name that ends in `.T` stands for the transpose of the matrix with the rest of the name.
     """
 
     left: str
@@ -43,12 +43,12 @@ class Product:
 
 @dataclass(frozen=True)
 class Pass:
-    """A batch going through networks side by side, one a row."""
+    """A batch that passes through `rows` networks side by side."""
 
     network: str
     """The network that owns the weights."""
     inputs: str
-    """The input, which names the matrix products."""
+    """The name of the input, a part of the matrices' names."""
     rows: int
     batch: int
     widths: Sequence[int]
@@ -74,7 +74,7 @@ class Pass:
         ]
 
     def input_gradients(self, columns: int) -> list[Product]:
-        """Gradients of every layer's input, of the first one's only for the last `columns` (0: not at all)."""
+        """Gradients of every layer's input; of the network's input only the last `columns` (0: none)."""
         wanted = [columns, *self.widths[1:]]
         return [
             Product(self._g(i + 1), f"{self._w(i)}.T", self._g(i), self.rows, self.batch, self.widths[i + 1], wanted[i])
@@ -97,7 +97,7 @@ class Pass:
 
 @dataclass(frozen=True)
 class Update:
-    """The products of one update of all seeds, and those that only every `delay`-th update has besides."""
+    """The products of every update of all seeds, and the additional products of every `delay`-th update."""
 
     always: list[Product]
     delayed: list[Product]
@@ -110,8 +110,8 @@ class Update:
 
 
 def update_products(base: str, config: Config, obs_dim: int, action_dim: int, seeds: int) -> Update:
-    """The products of an update of TD3 or SAC (`base`) of `seeds` seeds in lockstep."""
-    batch, both = config.batch_size, 2 * seeds  # a critic of each kind for every seed
+    """The products of an update of TD3 or SAC (`base`) with `seeds` seeds in lockstep."""
+    batch, both = config.batch_size, 2 * seeds  # two critics for every seed
     outputs = 2 * action_dim if base == "SAC" else action_dim  # SAC's actor has a mean and a deviation
     actor = [obs_dim, *config.hidden, outputs]
     critic = [obs_dim + action_dim, *config.hidden, 1]
@@ -128,7 +128,7 @@ def update_products(base: str, config: Config, obs_dim: int, action_dim: int, se
     ]
 
     present = Pass("actor", "s", seeds, batch, actor)
-    # TD3's actor follows the first critic alone, SAC's the lower one of the two.
+    # The loss of TD3's actor uses the first critic only, that of SAC's actor the minimum of both.
     judge = Pass("critic", "s, mu(s)", both if base == "SAC" else seeds, batch, critic)
     actor_step = [
         *present.forward(),
@@ -143,9 +143,9 @@ def update_products(base: str, config: Config, obs_dim: int, action_dim: int, se
 
 
 class Floor:
-    """Carries out the products of updates one after the other, in float32.
+    """Computes the products of updates one after the other, in float32.
 
-    Matrices of one name are one piece of memory, so that as much of it passes through the caches as in training.
+    Matrices with the same name share memory, so that as much memory passes through the caches as in training.
     """
 
     def __init__(self, update: Update, device: torch.device | str = "cpu"):
@@ -157,14 +157,14 @@ class Floor:
                 key = name.removesuffix(".T")
                 shapes[key] = tuple(map(max, shapes.get(key, stored), stored))
         generator = torch.Generator().manual_seed(0)
-        # As small as weights, so that no product overflows.
+        # Small numbers, as weights are, so that no product overflows.
         self.memory = {name: 0.1 * torch.randn(shape, generator=generator) for name, shape in shapes.items()}
         self.memory = {name: matrix.to(device) for name, matrix in self.memory.items()}
         self.always = [self._views(product) for product in update.always]
         self.delayed = [self._views(product) for product in update.delayed]
 
     def update(self) -> None:
-        """The products of one update."""
+        """Compute the products of one update."""
         self.updates += 1
         for left, right, out in self.always:
             torch.bmm(left, right, out=out)
@@ -176,7 +176,7 @@ class Floor:
         return [self._view(name, shape) for name, shape in _operands(product)]
 
     def _view(self, name: str, shape: tuple[int, ...]) -> Tensor:
-        """The matrices of this name: of all rows the first `shape[0]`; of an input's columns the last (the action)."""
+        """A view of the matrix `name`: its first `shape[0]` rows; of a transpose only the last columns (the action)."""
         matrix = self.memory[name.removesuffix(".T")]
         if name.endswith(".T"):
             matrix = matrix.mT
@@ -185,6 +185,6 @@ class Floor:
 
 
 def _operands(product: Product) -> list[tuple[str, tuple[int, ...]]]:
-    """Left, right and out: name and shape."""
+    """Name and shape of left, right and out."""
     rows, m, k, n = product.rows, product.m, product.k, product.n
     return [(product.left, (rows, m, k)), (product.right, (rows, k, n)), (product.out, (rows, m, n))]

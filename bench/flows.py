@@ -1,4 +1,4 @@
-"""How accurate the flows of DFlow and SFlow become, and what their training costs: the tables of docs/flows.md.
+"""Accuracy of the flows of DFlow and SFlow, and the cost of their training: the tables of docs/flows.md.
 
     python bench/flows.py                                        # all tasks, both ways: some eight minutes on one core
     python bench/flows.py env=HC+O flow=mle flow_steps=10000 flow_width=256 every=2500
@@ -6,13 +6,13 @@
 
 Words: `env=` and `flow=` (lists), every other setting of a flow's training, and
 
-    every=N            a row each N steps from step 0 on, not at the end alone
-    stop=SHARE         ends a training at the first row with this accuracy
+    every=N            a row every N steps, from step 0 on; without it, a row at the end only
+    stop=SHARE         end a training at the first row with at least this accuracy
     recipe=published   widths, learning rates, softness and steps of FlowPG (flow=mle) and CV-Flow (flow=reverse); the
-                       rate stays the same, and no point is moved to the box's faces
+                       learning rate is constant, and no point is moved to the box's faces
 
-Prints, a row at a time: the step; CPU seconds of this process, on one thread, random play and samples included and
-measures left out; accuracy; that on the box's faces; recall (core/flow_training.py, `measure`).
+Prints a row at a time: step; CPU seconds of this process on one thread, with random play and samples but without the
+measures; accuracy; accuracy on the box's faces; recall (core/flow_training.py, `measure`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dataclasses import fields
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# Scripts find modules beside themselves; those needed here lie in the project.
+# A script's own folder is first on the path; the imports below need the project root.
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 import torch
@@ -50,7 +50,7 @@ COLUMNS = ("task", "flow", "step", "seconds", "accuracy", "on faces", "recall")
 
 
 class Published(FlowTraining):
-    """The training as FlowPG and CV-Flow have it, with this project's start of the network and states."""
+    """The training of FlowPG and CV-Flow, but with this project's initial network and states."""
 
     def learning_rate(self) -> float:
         return self.flow.flow_learning_rate
@@ -60,7 +60,10 @@ class Published(FlowTraining):
 
 
 def rows(config: Config, recipe: type[FlowTraining], every: int, stop: float) -> Iterator[tuple]:
-    """Train the flow of `config`; a row of `COLUMNS` each `every` steps (0: at the end alone)."""
+    """Train the flow of `config` and yield a row of `COLUMNS` every `every` steps (0: at the end only).
+
+    Ends early at the first row whose accuracy is at least `stop`.
+    """
     flow, seconds, started = Flow().configured(config), 0.0, time.process_time()
     training = recipe(flow, TASKS[config.env].constraint, random_play(config, lambda: None))
     while True:

@@ -1,38 +1,38 @@
-"""Everything there is to measure on a GPU, in one call of a few minutes.
+"""All measurements on a GPU, in one call of a few minutes.
 
     python bench/gpu.py                                       # at most 9 minutes, into bench/results/gpu
     python bench/gpu.py minutes=5 parts=updates,runs out=FOLDER
     python bench/gpu.py device=cpu parts=updates seeds=1      # the same on a CPU
     python bench/gpu.py parts=updates base=TD3,SAC task=R+L2,HC+O seeds=1,10,30 steps=200       # the defaults of a part
 
-The parts come in this order, and each result is saved as soon as it is there, so that an early end leaves the rest:
+The parts run in this order. Each result is saved at once, so that an early end keeps all results before it:
 
-- `tests`: those that need CUDA (tests.txt);
+- `tests`: the tests that need CUDA (output in tests.txt);
 - `updates`: gradient steps of TD3 (DPre) and SAC (SPre), sampling included, of 1, 10 and 30 seeds in lockstep on R+L2
   and HC+O, beside the floor (the same matrix products and nothing else, as a CUDA graph) and, for one seed, beside
   eager PyTorch in CleanRL's style (bench/eager.py); CPU time of the thread that launches them; GPU memory;
-- `agreement`: how far parameters on the GPU are from those on the CPU over the first 200 updates, all 13 algorithms,
-  beside what one rounding of the first parameters makes on the CPU;
-- `runs`: steps a second of whole runs, environment included, and where the time of a step of all seeds goes;
-- `cells`: full-length cells of R+L2, the algorithms `cells` with the seeds `cell_seeds`, a process each, until the time
-  is over. Their folders are in `out`/runs, without checkpoints while they run; the same command resumes those that the
-  time has cut short. Where NVIDIA's Multi-Process Service is installed, the processes share the GPU through it;
+- `agreement`: the difference between parameters on the GPU and on the CPU over the first 200 updates, all 13
+  algorithms, and for comparison the difference that a rounding of the initial parameters causes on the CPU;
+- `runs`: steps a second of whole runs, environment included, and the phases of a step of all seeds;
+- `cells`: full-length cells of R+L2, the algorithms `cells` with the seeds `cell_seeds`, a process for each algorithm,
+  until the time is over. Their folders are in `out`/runs. They write a checkpoint only when the time is over; the same
+  command then resumes them. If NVIDIA's Multi-Process Service is installed, the processes share the GPU through it;
   otherwise they take turns.
 
-Every part has a table in `out` as CSV and Markdown, gpu.md has all of them, and machine.json names the machine. What
-fails is in errors.txt, and the rest goes on.
+Every part has a table in `out` as CSV and Markdown. gpu.md has all tables, and machine.json names the machine. Errors
+are in errors.txt; the other measurements continue.
 
-A machine that has PyTorch and no network needs some wheels of its Python version, 34 MB for all parts but the tests:
+A machine with PyTorch but without network needs some wheels of its Python version, 34 MB for all parts but the tests:
 
     pip download -d wheels --no-deps --only-binary=:all: -c requirements-lock.txt gymnasium farama-notifications \\
         cloudpickle mujoco mujoco-core omegaconf pyyaml tqdm numpy pillow typing_extensions
 
-The tests need pytest, pytest-xdist, hypothesis, matplotlib, scipy and what these depend on besides. On that machine:
+The tests also need pytest, pytest-xdist, hypothesis, matplotlib, scipy and their dependencies. On that machine:
 
     pip install --no-index --no-deps --target FOLDER wheels/*
     PYTHONPATH=FOLDER MUJOCO_GL=disable python bench/gpu.py
 
-With MUJOCO_GL=disable MuJoCo needs neither OpenGL nor the packages around it.
+With MUJOCO_GL=disable, MuJoCo needs neither OpenGL nor its packages.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parents[1]
-# Scripts find modules beside themselves; those needed here lie in the project.
+# A script's own folder is first on the path; the imports below need the project root.
 sys.path[0] = str(ROOT)
 
 import torch
@@ -91,7 +91,7 @@ RUN_SEEDS = (1, 10)
 CELL_TASK = "R+L2"
 CELL_WORDS = ["checkpoint_every=1000000000", "threads=1"]
 STOPPING = 40
-"""Seconds that cells get to save what they have, at the end."""
+"""Seconds reserved at the end for the cells to write their checkpoints."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def runs_table(records: Sequence[dict]) -> Table:
 def measure_each(
     options: Options, cases: Sequence[tuple], measure: Callable[..., Any], table: Callable[[list], Table]
 ) -> Table | None:
-    """The table of the measurements of `cases`, as many as the time allows; saved after each."""
+    """Measure as many of `cases` as the time allows; save their table after each. None if there is no measurement."""
     records: list[dict] = []
     for case in cases:
         if options.seconds_left < 0:
@@ -201,7 +201,7 @@ def measure_each(
             break
         try:
             found = measure(*case, options.device)
-        except Exception:  # time on a GPU is short: what one case does not stand must not cost the others
+        except Exception:  # GPU time is scarce: a case that fails must not cost the others
             report(options, f"{case}")
             continue
         records += found if isinstance(found, list) else [found]
@@ -211,7 +211,7 @@ def measure_each(
 
 
 def report(options: Options, what: str) -> None:
-    """Keep the error that is handled, in errors.txt."""
+    """Print the exception that is being handled and append it to errors.txt."""
     text = f"{what}:\n{traceback.format_exc()}\n"
     print(text, file=sys.stderr, flush=True)
     with open(options.out / "errors.txt", "a", encoding="utf-8") as file:
@@ -230,7 +230,7 @@ def measure_agreement_of(options: Options) -> Table | None:
 def measure_runs_of(options: Options) -> Table | None:
     many = min(os.cpu_count() or 1, 8)
     cases = [(b, t, s, 1) for t in options.tasks for s in RUN_SEEDS for b in options.bases]
-    if many > 1 and "HC+O" in options.tasks:  # closed-form arms have no threads
+    if many > 1 and "HC+O" in options.tasks:  # Reacher's closed form uses no threads
         cases += [(b, "HC+O", RUN_SEEDS[-1], many) for b in options.bases]
     return measure_each(options, cases, measure_run, runs_table)
 
@@ -262,7 +262,7 @@ def train_cells(options: Options) -> Table | None:
 
 
 def stop(processes: Sequence[subprocess.Popen]) -> None:
-    """Ask those that still run to save and end, and end those that do not."""
+    """Ask the running processes to save and end; kill those that do not end in time."""
     for process in processes:
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
@@ -276,10 +276,13 @@ def stop(processes: Sequence[subprocess.Popen]) -> None:
 
 
 def cell_record(options: Options, name: str, code: int, wall: float) -> dict[str, Any]:
-    """How far a cell has come, and its mean return if it is done. Seconds are those of the training itself."""
+    """The progress of a cell and the mean return of its finished seeds.
+
+    `seconds` counts the training itself if a seed is finished, else it is `wall`.
+    """
     runs = []
     for folder in find_runs(options.out / "runs"):
-        with suppress(ValueError):  # the time was over before its files were whole
+        with suppress(ValueError):  # the time was over before its files were complete
             runs.append(read_run(folder))
     runs = [run for run in runs if run.algo == name]
     results = [run.result for run in runs if run.result]
@@ -331,7 +334,7 @@ def parse_arguments(arguments: Sequence[str]) -> Options:
 
 
 def measure_all(options: Options) -> None:
-    """Every part in its order. gpu.md grows with each."""
+    """Run the chosen parts in order and add the table of each to gpu.md."""
     parts = {
         "tests": run_tests,
         "updates": measure_updates_of,
@@ -366,7 +369,7 @@ def main(arguments: list[str]) -> int:
         return 0
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # what was started is stopped first
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # `finally` stops the cells first
     try:
         options = parse_arguments(arguments)
         options.out.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Measurements of seeds in lockstep on any device: gradient steps, whole runs, and how far two devices agree."""
+"""Measurements of seeds in lockstep on any device: gradient steps, whole runs, and the agreement of two devices."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from core.cuda_graph import CapturedStep, GradientSteps
 
 ALGO = {"TD3": "DPre", "SAC": "SPre"}
 TRANSITIONS = 1_000
-"""In each seed's replay buffer, for gradient steps."""
+"""Number in each seed's replay buffer, for the measurement of gradient steps."""
 ROUNDS = 5
 WARM_UP, SETTLED, LEARNED = 1_000, 2_000, 5_000
-"""Of a run: environment steps before the first gradient step, before the measurement, and at its end."""
+"""Environment steps of a run before the first gradient step, at the start of the measurement, and at its end."""
 COMPARED = (1, 10, 50, 200)
 """Gradient steps after which devices are compared."""
 ROUNDINGS = 3
 NEVER = 10**9
 
 PHASES = ("draws", "policy", "map", "environments", "transfer", "gradient step", "waiting", "rest")
-"""Where the wall-clock time of a run goes. `draws` are those of gradient steps; `policy` has the draws of exploration,
-the way to the device and back, and the wait for gradient steps before it; `transfer` is that of transitions; `gradient
-step` is its launch; `waiting` is the question for losses that are not finite."""
+"""Phases of a run's wall-clock time. `draws` are the random numbers of gradient steps. `policy` includes the random
+numbers of exploration, the copies to the device and back, and the wait for earlier gradient steps. `transfer` is the
+storing of transitions, `gradient step` the launch of one, and `waiting` the check for losses that are not finite."""
 
 
 def wait_for(device: torch.device) -> None:
@@ -43,7 +43,7 @@ def wait_for(device: torch.device) -> None:
 
 
 def rates(call: Callable[[], object], count: int, device: torch.device) -> tuple[float, float]:
-    """Calls in a second, and CPU milliseconds of this thread in a call: medians of rounds of `count` calls."""
+    """Calls a second, and CPU milliseconds of this thread a call: medians over rounds of `count` calls."""
     for _ in range(10):
         call()
     wait_for(device)
@@ -60,17 +60,17 @@ def rates(call: Callable[[], object], count: int, device: torch.device) -> tuple
 
 @contextmanager
 def memory_of(device: torch.device) -> Iterator[Callable[[], float | str]]:
-    """A function that returns the most GPU memory in megabytes since the beginning, "" on a CPU."""
+    """Yield a function that returns the peak GPU memory since the start, in megabytes ("" on a CPU)."""
     on_gpu = device.type == "cuda"
     if on_gpu:
-        gc.collect()  # agents and their graphs refer to each other
+        gc.collect()  # agents and their graphs form reference cycles
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
     yield lambda: torch.cuda.max_memory_allocated(device) / 1e6 if on_gpu else ""
 
 
 def floor_rate(floor: Floor, count: int, device: torch.device) -> float:
-    """Updates in a second of the matrix products alone, on a GPU as a CUDA graph."""
+    """Updates a second of the matrix products alone; a GPU runs them as a CUDA graph."""
     if device.type != "cuda":
         return rates(floor.update, count, device)[0]
     stream = torch.cuda.Stream(device)
@@ -87,7 +87,7 @@ def floor_rate(floor: Floor, count: int, device: torch.device) -> float:
 
 
 def measure_updates(base: str, task: str, seeds: int, count: int, device: torch.device) -> dict[str, Any]:
-    """A record of the gradient steps of `seeds` seeds, `count` of them in each round."""
+    """A record of the speed and memory of gradient steps of `seeds` seeds in lockstep, `count` steps in each round."""
     config = make_config(ALGO[base], env=task, device=device)
     with memory_of(device) as peak:
         agent = agent_of(config, range(seeds))
@@ -105,11 +105,11 @@ def measure_updates(base: str, task: str, seeds: int, count: int, device: torch.
 
 
 def measure_agreement(name: str, task: str, device: torch.device) -> list[dict[str, Any]]:
-    """How far the parameters of two seeds on `device` are from those on the CPU, after numbers of gradient steps.
+    """Records of the difference between the parameters of two seeds on `device` and on the CPU after `COMPARED` steps.
 
-    The difference is the largest of any parameter tensor, relative to the largest number in it. `rounding` is that
-    between trainings on the CPU whose first parameters differ by a rounding, the largest of `ROUNDINGS`: what a kink of
-    a network or a map makes of a rounding.
+    `difference` is the largest of any parameter tensor, relative to the largest number in the tensor. `rounding` is the
+    largest such difference among `ROUNDINGS` trainings on the CPU whose initial parameters differ by a rounding. It
+    shows how far kinks of a network or a map amplify roundings.
     """
     there_config = make_config(name, env=task, hidden="[64,64]", batch_size=32, device=device)
     here_config = replace(there_config, device="cpu")
@@ -147,11 +147,11 @@ def difference(agent: Agent, other: Agent) -> float:
 
 
 class _Enough(BaseException):
-    """Ends a training loop from within. The loop reports an Exception as an error."""
+    """Ends a training loop from within. A BaseException, as the loop would report an Exception as an error."""
 
 
 def measure_run(base: str, task: str, seeds: int, threads: int, device: torch.device) -> dict[str, Any]:
-    """A record of a whole run's speed, environment included, between `SETTLED` and `LEARNED` steps."""
+    """A record of the speed and phases of a whole run, environment included, between `SETTLED` and `LEARNED` steps."""
     never = dict.fromkeys(("steps", "eval_every", "checkpoint_every"), NEVER)
     config = make_config(
         ALGO[base], env=task, device=device, learning_starts=WARM_UP, buffer_size=2 * LEARNED, threads=threads, **never
@@ -186,7 +186,7 @@ def measure_run(base: str, task: str, seeds: int, threads: int, device: torch.de
                 else [(agent, "update", "gradient step")]
             ),
         ]
-        if agent.placement == "environment":  # the map is no part of a gradient step
+        if agent.placement == "environment":  # the map is not part of gradient steps
             watches.append((agent, "feasible", "map"))
         for owner, name, phase in watches:
             watched.enter_context(watch.watch(owner, name, phase))

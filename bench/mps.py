@@ -1,4 +1,4 @@
-"""NVIDIA's Multi-Process Service (MPS), through which processes share a GPU."""
+"""NVIDIA's Multi-Process Service (MPS), which lets processes share a GPU."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ MPS = "nvidia-cuda-mps-control"
 
 @contextmanager
 def shared_gpu(device: torch.device) -> Iterator[dict[str, str]]:
-    """Runs NVIDIA's Multi-Process Service. Gives what processes need in their environment, nothing if there is none.
+    """Run NVIDIA's Multi-Process Service and yield the environment variables that processes need to use it.
 
-    The service runs kernels of several processes side by side. Without it a GPU runs those of one process at a time.
+    Yields {} if `device` is no GPU, or if the service is missing or does not start. The service runs kernels of several
+    processes side by side. Without it, a GPU runs the kernels of one process at a time.
     """
     if device.type != "cuda" or not shutil.which(MPS):
         yield {}
         return
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # the service may write until it has ended
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # the service may still write
         environment = {"CUDA_MPS_PIPE_DIRECTORY": folder, "CUDA_MPS_LOG_DIRECTORY": folder}
 
         def control(*options: str, text: str = "") -> None:

@@ -1,4 +1,4 @@
-"""Sets of one's own for the benchmark of constraints: rows, and rows with an ellipse, in several sizes."""
+"""User-defined sets for the benchmark of constraints: rows, and rows with an ellipse, in several sizes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from constraints import Constraint, Intersection, LinearConstraint, QuadraticCon
 
 
 def legs(obs: Tensor) -> Tensor:
-    """The joint velocities of each leg of a HalfCheetah (..., 2, 6): its mechanical power is a row."""
+    """Rows (..., 2, 6) with the joint velocities of each leg of a HalfCheetah: row times action is the leg's power."""
     velocity = obs[..., 11:17].unflatten(-1, (2, 3))
     return torch.diag_embed(velocity.movedim(-2, -1)).movedim(-3, -1).flatten(-2)
 
 
 def random_rows(rows: int, dim: int) -> LinearConstraint:
-    """Rows that turn with the observation, at distances from 0.05 to 0.55 from the origin."""
+    """Half-spaces whose normals turn with the observation, at distances of 0.05 to 0.55 from the origin."""
     generator = torch.Generator(device="cpu").manual_seed(rows * dim)
     first, second = torch.randn(2, rows, dim, generator=generator, dtype=torch.float64).unbind()
     distance = 0.05 + 0.5 * torch.rand(rows, generator=generator, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's TD3 and SAC on the task of our benchmark, for comparison (`pip install -e '.[bench]'`)."""
+"""Stable-Baselines3's TD3 and SAC on the task of the benchmark, for comparison (`pip install -e '.[bench]'`)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def peer_version() -> str:
 
 
 class Peer:
-    """A model with the hyperparameters of `config`, and `transitions` steps under random actions in its replay buffer.
+    """A model with the hyperparameters of `config`; its replay buffer holds `transitions` steps under random actions.
 
     Like our DPre and SPre, it trains on the environment that projects."""
 
@@ -54,9 +54,9 @@ class Peer:
         self.model.learn(transitions, log_interval=None)
 
     def update(self, steps: int) -> None:
-        """`steps` gradient steps."""
+        """Take `steps` gradient steps."""
         self.model.train(gradient_steps=steps, batch_size=self.model.batch_size)
 
     def collect(self, steps: int) -> None:
-        """`steps` environment steps: `collect_rollouts`, that is, policy, noise, environment and replay buffer."""
+        """Take `steps` environment steps by `collect_rollouts`: policy, noise, environment and replay buffer."""
         self.model.learn(steps, log_interval=None, reset_num_timesteps=False)

@@ -3,8 +3,8 @@
     python bench/pendulum.py                        # needs Stable-Baselines3 (pip install -e '.[bench]')
     python bench/pendulum.py steps=1000 out=here.png
 
-Trains SAC of Stable-Baselines3 for `steps` environment steps with and without `envs.Constrained`, and prints for both
-how many steps were faster than the limit. The picture (docs/pendulum.png) has speed and return of each episode.
+Trains SAC of Stable-Baselines3 for `steps` environment steps with and without `envs.Constrained`. Prints for both the
+number of steps above the limit. The picture (docs/pendulum.png) shows the speed and return of each episode.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ GRAVITY, MOTOR = 4.5 * STEP, 3.0 * STEP  # a step adds GRAVITY sin(angle) + MOTO
 
 
 class SpeedLimit(LinearConstraint):
-    """In a step, the speed may come nearer to +-LIMIT by half of the distance that is left."""
+    """In each step, the speed may cover at most half of the distance that is left to LIMIT or to -LIMIT."""
 
     def A(self, obs: Tensor) -> Tensor:
         return obs.new_tensor([[MOTOR], [-MOTOR]])
@@ -66,7 +66,7 @@ class Record(gymnasium.Wrapper):
 
 
 def make(limited: bool) -> Record:
-    """A pendulum with so little gravity that its motor can hold it in any position."""
+    """A pendulum with so little gravity that the motor can hold it in any position."""
     env = gymnasium.make("Pendulum-v1", g=3.0)
     if limited:
         env = Constrained(env, InUnits(SpeedLimit(dim=1), env.action_space.low, env.action_space.high))
@@ -87,7 +87,7 @@ def draw(records: dict[str, Record], path: Path) -> None:
     figure = Figure((8, 3), layout="constrained")
     left, right = figure.subplots(1, 2)
     for (name, record), color in zip(records.items(), ("#1b6f3a", "#999999"), strict=True):
-        ended = len(record.speeds) - 1  # an episode has begun after the last step
+        ended = len(record.speeds) - 1  # the last episode has not ended
         episodes = np.arange(1, ended + 1)
         left.plot(episodes, record.speeds[:ended], color=color, label=name)
         right.plot(episodes, record.returns[:ended], color=color, label=name)

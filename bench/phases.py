@@ -1,14 +1,13 @@
-"""Where the time of a training run goes, by phase.
+"""The time of a training run by phase.
 
-The run is made by `sweep.train.make_trainer`, with the paper's settings on HC+O, and is 10,000 steps long. Gradient
-steps begin after 9,500 of them. TD3 takes them every 100 steps instead of once an episode of 1,000, but still one for
-each step. The run has two evaluations, a final one of the same length, and two checkpoints: of all 10,000 transitions,
-and at the end.
+`sweep.train.make_trainer` makes the run, with the paper's settings on HC+O and 10,000 steps. Gradient steps begin after
+9,500 steps. TD3 takes 100 of them every 100 steps, instead of 1,000 after each episode of 1,000 steps. The run has two
+evaluations, a final one of the same length, and two checkpoints: one of all 10,000 transitions, and one at the end.
 
-Each phase's time is scaled to the protocol's million steps: gradient steps and exploration to the 9e5 steps after its
-own warm-up; evaluations to its number of episodes, without the first evaluation here, which makes the environments;
-logging to its number of evaluations; checkpoints to one each 10,000 steps, for which the two of this run count as one;
-everything else in proportion to the environment steps.
+The time of each phase is scaled to the protocol's million steps: gradient steps and exploration to the 9e5 steps after
+the protocol's warm-up; evaluations to its number of episodes, without this run's first evaluation, which makes the
+environments; logging to its number of evaluations; checkpoints to one every 10,000 steps, where the two of this run
+count as one; everything else in proportion to the environment steps.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ from store.writer import RunWriter
 from sweep.train import make_trainer
 
 STEPS, WARM_UP = 10_000, 9_500
-"""Environment steps of each seed, and those before the first gradient step."""
+"""Environment steps of each seed, in all and before the first gradient step."""
 EPISODES = 5
-"""Of an evaluation."""
+"""Episodes of an evaluation."""
 
 UPDATE = ("replay sampling", "forward and backward", "optimiser", "target update")
 OUTSIDE = ("exploration", "map", "environment", "storing", "evaluation", "checkpoint", "logging", "everything else")
@@ -43,7 +42,7 @@ OUTSIDE = ("exploration", "map", "environment", "storing", "evaluation", "checkp
 
 @dataclass(frozen=True)
 class Phases:
-    """Seconds of each phase, of all seeds together: as measured, and of a million steps a seed of the protocol."""
+    """Seconds of each phase, all seeds together: as measured, and scaled to the protocol's million steps a seed."""
 
     measured: dict[str, float]
     scaled: dict[str, float]
@@ -53,14 +52,14 @@ class Phases:
 
 
 class Stopwatch:
-    """Seconds of the calls of functions and methods, each call by itself, on `clock`."""
+    """Measures the seconds of every single call of watched functions and methods, on `clock`."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self.clock = clock
         self.calls: dict[str, list[float]] = defaultdict(list)
 
     def watch(self, owner: Any, name: str, phase: str) -> Any:
-        """A context in which the calls of `owner.name` count for `phase`."""
+        """A context manager that times the calls of `owner.name` and assigns them to `phase`."""
         inner = getattr(owner, name)
 
         def timed(*arguments, **options):
@@ -80,9 +79,9 @@ class Stopwatch:
 def new_trainer(
     config: Config, seeds: Sequence[int], stop_if_asked: Callable[[], None] = lambda: None
 ) -> Iterator[Trainer]:
-    """A trainer as run.py makes it, without a progress bar, whose folders are deleted afterwards.
+    """Yield a trainer as run.py makes it, but without a progress bar; its folders are deleted afterwards.
 
-    A map that learns before the training has learned nothing: speed does not depend on it.
+    A map that is learned before the training stays untrained, because speed does not depend on it.
     """
     with tempfile.TemporaryDirectory() as folder:
         writers = [

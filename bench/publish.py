@@ -1,15 +1,15 @@
-"""Publish finished runs: add them to the data that the repository carries.
+"""Publish finished runs: add them to the data in the repository.
 
-    python bench/publish.py results/                         # every cell of it, to docs/data
+    python bench/publish.py results/                         # all its cells, to docs/data
     python bench/publish.py results/ env=R+L2 algo=DPre+     # these cells only
     python bench/publish.py results/ settings=any            # runs of a study, with other settings than the paper's
     python bench/publish.py results/ out=DIR                 # to another folder
 
-A cell (task, algorithm and settings) is published with all its seeds or not at all, so that no seed is dropped. It is
-refused where a run has not ended, where its provenance is missing, names uncommitted code or more than one commit,
-where its settings are not those that its folder says and, without `settings=any`, where they are not the paper's. A
-seed that is published already stays as it is, and a second run of it is refused alone. The command names every refused
-run with the reason, publishes the rest, and exits with code 1.
+A cell (task, algorithm and settings) is published with all its seeds or not at all, so that no seed is dropped. A cell
+is refused if one of its runs has not ended, lacks its provenance, ran with uncommitted code or at several commits, has
+other settings than its folder's name says or, without `settings=any`, other settings than the paper's. A published seed
+is never replaced: another run of the same seed is refused, but not the rest of its cell. If runs are refused, the
+command prints each with the reason, publishes the rest, and exits with code 1.
 
 The files are described in store/published.py; `python plot.py docs/data` makes tables and figures from them.
 """
@@ -23,7 +23,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-# Scripts find modules beside themselves; those needed here lie in the project.
+# A script's own folder is first on the path; the imports below need the project root.
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from algos import ALGORITHMS, saved_config
@@ -45,7 +45,10 @@ class RefusedError(Exception):
 def publish(
     root: Path, out: Path, tasks: Sequence[str] | None, algos: Sequence[str] | None, any_settings: bool
 ) -> tuple[list[str], list[str]]:
-    """Publish the cells of `root`; the published runs and the refused ones, a line each. None stands for all names."""
+    """Publish the cells of `root` in `out`; return the published and the refused runs, a line each.
+
+    `tasks` and `algos` select cells; None selects all. Raises ConfigError if no cell is selected.
+    """
     cells: dict[tuple[str, str], list[Path]] = defaultdict(list)
     for folder in find_runs(root):
         task, variant = folder.parent.parent.name, folder.parent.name

@@ -1,7 +1,7 @@
-"""How long the cells of the table take, for the estimates of sweeps: measures them and writes sweep/rates.csv.
+"""Measures how long the cells of the table take, and writes sweep/rates.csv for the time estimates of sweeps.
 
     python bench/rates.py                                  # all cells: some 15 minutes on one core
-    python bench/rates.py algo=SRad env=W+M out=rates.csv  # only these, elsewhere
+    python bench/rates.py algo=SRad env=W+M out=rates.csv  # one cell, to another file
 
 Each cell trains through 100 environment steps of warm-up and then 20 with one gradient step each, at the paper's batch
 size, on one thread. The columns are the milliseconds of a gradient step and of an environment step of all ten seeds
@@ -38,7 +38,7 @@ class _Enough(Exception):
 
 
 def measure(config: Config) -> dict[str, object]:
-    """One row of the file."""
+    """Measure a cell; return its row of the file."""
     watch, ends = Stopwatch(time.process_time), []
 
     def stop_if_asked() -> None:  # the loop calls it between any two steps

@@ -1,15 +1,15 @@
-"""The closed form of Reacher beside PyBullet: equal bits, speed of a step, and its share of training.
+"""The closed form of Reacher beside PyBullet: equality of bits, speed of a step, and share of the training time.
 
     python bench/reacher.py                       # needs PyBullet, that is, Python up to 3.11
     python bench/reacher.py steps=20000 seeds=1
 
 Three tables:
 
-- equality: of `steps` steps in seven kinds of episodes, how many have a joint angle or speed with a differing bit, the
-  largest speed, and the share of steps at the limit of joint 1;
+- equality: among `steps` steps in seven kinds of episodes, the number with a differing bit in a joint angle or speed,
+  the largest speed, and the share of steps at the limit of joint 1;
 - microseconds of a step of one arm, and of many arms that step together;
-- training: seconds in the environment, and environment steps in a second, of DRad on R+L2 for each number of `seeds` in
-  lockstep, 10,000 random steps and 500 gradient steps a seed, on one thread. The two simulators take turns.
+- training of DRad on R+L2 for each number of `seeds` in lockstep: seconds in the environment and environment steps a
+  second, with 10,000 random steps and 500 gradient steps a seed on one thread. The two simulators take turns.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 
-# Scripts find modules beside themselves; those needed here lie in the project.
+# A script's own folder is first on the path; the imports below need the project root.
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 import numpy as np
@@ -42,7 +42,7 @@ KINDS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
     "20-fold": lambda rng: 20 * rng.uniform(-1, 1, (EPISODE, 2)),
     "20-fold, held 20 steps": lambda rng: 20 * rng.choice([-1.0, 1.0], (8, 2)).repeat(20, 0)[:EPISODE],
 }
-"""Torques of an episode, in units of the task's largest."""
+"""Torques of an episode, in units of the task's largest torque."""
 TRAINING = "algo=DRad env=R+L2 steps=10500 learning_starts=10000 eval_every=10500 final_episodes=5 threads=1"
 
 

@@ -5,16 +5,16 @@
     python bench/runtime.py seeds=10                               # ten seeds in lockstep: seconds of all ten
     python bench/runtime.py algo=DRad,SRad,DOpt,NFW device=cuda    # networks and replay buffer on a GPU
 
-A trial fills replay buffers with 1,000 steps of the environment under random feasible actions, makes new agents with
-the paper's hyperparameters but for the batch size, and has them take `steps` gradient steps, sampling included. At
+A trial fills replay buffers with 1,000 environment steps under random feasible actions, makes new agents with the
+paper's hyperparameters except for the batch size, and takes `steps` gradient steps with them, sampling included. At
 one batch size, the algorithms take turns of 50 steps, so that a slow moment of the machine affects all of them. Every
-trial has its own seeds. Every batch size is saved when it is measured, so that an interruption loses little.
+trial has its own seeds. The results of a batch size are saved at once, so that an interruption loses little.
 
 Prints a table and saves `out`/runtime.csv (default bench/results), a row a measurement, which `python plot.py runtime`
 draws. CPU seconds are CPU time of the process, on one thread, so that other load on the machine does not count. With a
-GPU, the two parts make up the wall-clock time: GPU seconds are the time in which its kernels run, from as many further
-gradient steps under PyTorch's profiler, CPU seconds the rest. The first steps capture CUDA graphs; with steps=10000
-they hardly count, and the time of one step times 9e5 is that of the gradient steps of a whole run.
+GPU, CPU and GPU seconds add up to the wall-clock time: GPU seconds are the time of the kernels, measured with PyTorch's
+profiler over as many further gradient steps; CPU seconds are the rest. The first steps capture CUDA graphs. With
+steps=10000 this hardly counts, and the time of one step times 9e5 estimates the gradient steps of a whole run.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# Scripts find modules beside themselves; those needed here lie in the project.
+# A script's own folder is first on the path; the imports below need the project root.
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 import torch
@@ -47,7 +47,7 @@ from tables import to_terminal
 FILL = 1_000
 """Transitions of each seed in the replay buffer."""
 TURN = 50
-"""Gradient steps that an algorithm takes before the next one has its turn."""
+"""Gradient steps in a turn of one algorithm."""
 DEFAULTS = {
     "algo": "all",
     "batch": "1,16,100,256",
@@ -60,7 +60,7 @@ DEFAULTS = {
 
 
 def measure(agents: Mapping[str, GradientSteps], steps: int, progress: Callable[[], None]) -> dict[str, tuple]:
-    """CPU and GPU seconds of the first `steps` gradient steps of each agent. They take turns; `progress` ends each."""
+    """CPU and GPU seconds of the first `steps` gradient steps of each agent. Every turn ends with `progress()`."""
 
     def train(take_gradient_step: GradientSteps, count: int) -> None:
         for _ in range(count):
@@ -85,10 +85,10 @@ def measure(agents: Mapping[str, GradientSteps], steps: int, progress: Callable[
 
 
 def kernel_seconds(call: Callable[[], None]) -> float:
-    """GPU seconds of the kernels that `call` launches; `call` waits for them."""
+    """GPU seconds of the kernels that `call` launches; `call` must wait for them."""
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         call()
-    # Events of the host may repeat the time of the kernels that they launch.
+    # Host events may repeat the time of the kernels that they launch.
     events = (event for event in profile.events() if event.device_type == torch.autograd.DeviceType.CUDA)
     return sum(event.self_device_time_total for event in events) * 1e-6
 
@@ -104,7 +104,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[list[str], list[int], dic
 
 
 def run_trials(names: Sequence[str], batches: Sequence[int], counts: dict[str, int], device: str, path: Path) -> None:
-    """Measure every cell `trials` times and write each measurement to `path` at once."""
+    """Measure every algorithm and batch size `trials` times; write to `path` after each trial of a batch size."""
     fixed = {
         "task": TASK,
         "seeds": counts["seeds"],

@@ -4,8 +4,8 @@
     python bench/shared_gpu.py processes=1,2 algo=SPre env=HC+O seeds=3 seconds=5
     python bench/shared_gpu.py device=cpu processes=1,2
 
-It prints a line for taking turns and, where the Multi-Process Service is installed, one for sharing, with a column for
-each number of processes.
+Prints a line for taking turns and, if the Multi-Process Service is installed, one for sharing. Each number of processes
+has a column.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sys
 import time
 from pathlib import Path
 
-# Scripts find modules beside themselves; those needed here lie in the project.
+# A script's own folder is first on the path; the imports below need the project root.
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 import torch
@@ -31,24 +31,25 @@ from sweep.train import check_device
 
 DEFAULTS = {"algo": "DPre", "env": "R+L2", "seeds": "10", "processes": "1,4,8", "seconds": "3", "device": "cuda"}
 TRANSITIONS, BLOCK = 300, 50
-"""Of each seed; gradient steps before a look at the clock."""
+"""Transitions of each seed; gradient steps between two looks at the clock."""
 NUMBER = "--number="
-"""The last word of each process that measures."""
+"""The start of the last argument of each measuring process."""
 PAUSE = 0.5
 """Seconds between two measurements."""
 
 
 def take_steps(options: dict[str, str], number: int, processes: list[int]) -> None:
-    """Measure as process `number`: print its updates of single seeds a second among each of so many `processes`.
+    """Measure as process `number`: print its single-seed updates a second for each number in `processes`.
 
-    It prints a line when it is ready, and begins at the time that stdin then has.
+    It pauses and prints 0 where only `number` processes or fewer take part. The process prints a line when it is ready,
+    reads a time (seconds since the epoch) from stdin, and starts then.
     """
     torch.set_num_threads(1)
     seeds, seconds = (whole_number(key, options[key]) for key in ("seeds", "seconds"))
     config = make_config(options["algo"], env=options["env"], device=options["device"])
     agent = agent_of(config, range(seeds))
     step = GradientSteps(agent, fill_replay(agent, TRANSITIONS), config.batch_size)
-    for _ in range(10):  # the first ones capture
+    for _ in range(10):  # the first steps capture CUDA graphs
         step()
     print("ready", flush=True)
     start = float(input())
@@ -68,7 +69,8 @@ def take_steps(options: dict[str, str], number: int, processes: list[int]) -> No
 
 
 def measure(options: dict[str, str], environment: dict[str, str]) -> list[float]:
-    """Updates of single seeds a second of all processes together, for each number of them. ConfigError if one fails."""
+    """Single-seed updates a second of all processes together, for each number of processes. Raises ConfigError if one
+    fails."""
     words = [f"{key}={value}" for key, value in options.items()]
     running = [
         subprocess.Popen(

@@ -1,16 +1,16 @@
-"""Does an infeasible action ever reach a robot? Every task, every map, the worst suggestions.
+"""Checks that no infeasible action ever reaches a robot: every task, every map, the worst suggestions.
 
     python bench/soak.py                                   # a million steps of the simulators, ten million checks
     python bench/soak.py env=W+M,R+T steps=1e4 checks=1e5 seed=1
 
 Suggestions come from random networks with exploding weights, from a list of extreme numbers (up to 3e38, denormal,
 -0.0, infinite, NaN) and from the boundary of the set. In the simulators each is mapped and executed in float32, as in
-training, and the environment checks it in float64. The checks without simulator take observations that no robot
-reaches: velocities of zero, denormal and up to 1e30, angles up to 7. (A map sees them in float32, which is too coarse
-for the sine of an angle of 1e5, and the check in float64 would notice.) A suggestion that is not finite must be refused
-with a clear message; every other one must be executed with a violation of at most 1e-6.
+training, and the environment checks it in float64. The checks without a simulator use observations that no robot
+reaches: velocities that are zero, denormal or as large as 1e30, angles up to 7. (A map sees float32, which is too
+coarse for the sine of larger angles, such as 1e5; the check in float64 would fail.) A suggestion that is not finite
+must be refused with a clear message; every other one must be executed with a violation of at most 1e-6.
 
-Prints the largest violation of each task and map, and how to reproduce one that is too large. The exit code is then 1.
+Prints the largest violation of each task and map. If one is too large, prints how to reproduce it and exits with 1.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ NOT_FINITE = [float("inf"), float("-inf"), float("nan")]
 
 
 class Soak:
-    """Runs the checks of one task and counts; `problems` are lines that tell how to reproduce a failure."""
+    """Runs and counts the checks of one task. `problems` has a line for each failure, with what reproduces it."""
 
     def __init__(self, task: str, seed: int, parallel: int):
         self.task, self.parallel, self.constraint = task, parallel, envs.constraint(task)
@@ -69,7 +69,7 @@ class Soak:
         return actor
 
     def spoil(self, obs: Tensor, suggested: Tensor) -> Tensor:
-        """Suggestions (n, d) with some replaced by extreme numbers and by points beside the boundary."""
+        """Suggestions (n, d), some of them replaced by extreme numbers and by points on or near the boundary."""
         n = len(suggested)
         suggested = torch.where(self.chance(0.5, n, 1), suggested, suggested.tanh())
         suggested = torch.where(self.chance(0.2, n, 1), self.pick(EXTREMES, n, self.dim), suggested)
@@ -81,14 +81,14 @@ class Soak:
         return torch.where(self.chance(0.1, n, 1) & beside.isfinite(), beside, suggested)
 
     def mapped(self, name: str, obs: Tensor, suggested: Tensor) -> Tensor:
-        """What the map `name` makes of suggestions (n, d). Agents put those for the gauge map into the box first."""
+        """Apply the map `name` to suggestions (n, d). For the gauge map, clamp them to the box first, as agents do."""
         if name == "gauge_map":
             suggested = suggested.clamp(-1.0, 1.0)
         return getattr(self.constraint, name)(obs, suggested)
 
     @torch.no_grad()
     def simulate(self, name: str, steps: int, progress: tqdm) -> None:
-        """`steps` steps of the simulators in all, with the map `name`."""
+        """Take at least `steps` simulator steps in all, with the map `name`."""
         robots = [envs.make(self.task) for _ in range(self.parallel)]
         seeds = torch.randint(2**31, (self.parallel,), generator=self.generator).tolist()
         obs = np.stack([env.reset(seed=seed)[0] for env, seed in zip(robots, seeds, strict=True)])
@@ -127,7 +127,7 @@ class Soak:
 
     @torch.no_grad()
     def check(self, name: str, count: int, progress: tqdm, batch: int = 2000) -> None:
-        """`count` suggestions in all through the map `name`, at observations that no robot reaches."""
+        """Check the map `name` with `count` suggestions in all, at observations that no robot reaches."""
         for start in range(0, count, batch):
             n = min(batch, count - start)
             obs = self._observations(n)
@@ -143,10 +143,10 @@ class Soak:
             progress.update(n)
 
     def _observations(self, n: int) -> Tensor:
-        """Observations (n, ...) in float64: of ordinary sizes, extreme, or some of both."""
+        """Observations (n, obs_dim) in float64 with ordinary entries, extreme entries, or both."""
         width = self.robot.obs_dim
         size = 10.0 ** (3 * torch.rand(n, 1, generator=self.generator) - 2)
-        ordinary = (size * self.normal(n, width)).double() * (1 + 1e-9)  # no float32 has these digits
+        ordinary = (size * self.normal(n, width)).double() * (1 + 1e-9)  # not representable in float32
         extreme = self.pick(EXTREMES, n, width).double().clamp(-1e30, 1e30)
         share = self.pick([0.0, 0.2, 1.0], n, 1)
         obs = torch.where(torch.rand(n, width, generator=self.generator) < share, extreme, ordinary)

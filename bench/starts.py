@@ -1,11 +1,11 @@
-"""How much the starts of 50 final episodes move a return on Reacher, and that the adjusted return has the same mean.
+"""Shows how much the starts of the final episodes change a return on Reacher, and that adjusting keeps its mean.
 
     python bench/starts.py results/R+L2/DPre/seed=0                  # the policy of a run
     python bench/starts.py results/R+L2/DPre/seed=0 seeds=0-99 episodes=20000
 
-The run's best policy plays the final episodes of each of `seeds` (default 0-9) and then `episodes` others (default
-5,000), whose mean is the true one up to its standard error. Prints, a seed a row, how far the mean return is from the
-true mean, as it is and adjusted (`plots/starts.py`).
+The run's best policy plays the final episodes of each of `seeds` (default 0-9) and `episodes` other episodes (default
+5,000), whose mean return estimates the true mean. Prints a row for each seed: the difference of its mean return from
+the true mean, plain and adjusted (`plots/starts.py`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-# Scripts find modules beside themselves; those needed here lie in the project.
+# A script's own folder is first on the path; the imports below need the project root.
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 import numpy as np
@@ -30,7 +30,7 @@ from tables import Table, print_table, text_cells
 
 
 def play(policy, environments: Sequence[envs.ActionConstrainedEnv]) -> np.ndarray:
-    """The returns of one episode in each environment, from its next reset on. Episodes of Reacher are equally long."""
+    """The returns (k,) of one episode in each of k environments, after a reset. All episodes have the same length."""
     obs = np.stack([env.reset()[0] for env in environments])
     returns = np.zeros(len(environments))
     for _ in range(environments[0].robot.max_episode_steps):
@@ -41,7 +41,7 @@ def play(policy, environments: Sequence[envs.ActionConstrainedEnv]) -> np.ndarra
 
 
 def final_returns(policy, task: str, seed: int, evaluations: int, parallel: int, episodes: int) -> np.ndarray:
-    """The returns (episodes,) of the policy on the starts of the final episodes of a run with `seed`."""
+    """The returns (episodes,) of the policy in the final episodes of a run with `seed`."""
     environments = [envs.make(task) for _ in range(parallel)]
     for k, env in enumerate(environments):
         env.reset(seed=stream_seed(seed, "evaluation", k))

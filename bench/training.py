@@ -11,12 +11,12 @@ TD3 is DPre (batch 100, layers of 400 and 300), SAC is SPre (batch 256, layers o
   on the same environment, which projects (bench/peer.py; `pip install -e '.[bench]'`).
 
 All take turns of `steps` gradient steps, then of ten times as many environment steps, replay sampling included, with
-10,000 transitions a seed in the buffer. A round is a turn of each, and every other round has the reverse order. A ratio
-is the median of the ratios within rounds, so that other load on the machine affects both sides alike. Times are the
-least and the median over rounds: CPU time of the process with one thread, wall-clock time with more.
+10,000 transitions a seed in the buffer. A round has one turn of each; every other round reverses the order. A ratio is
+the median of the ratios within rounds, so that other load on the machine affects both sides alike. Times are the least
+and the median over rounds: CPU time of the process with one thread, wall-clock time with more.
 
-Environment steps are those of the training loop that run.py runs (exploration, projection, simulator, replay buffer),
-and of Stable-Baselines3's `collect_rollouts`.
+Environment steps are taken by the training loop of run.py (exploration, projection, simulator, replay buffer) and by
+Stable-Baselines3's `collect_rollouts`.
 
 For the first number of threads and each number of seeds, a second table divides the wall-clock time of a whole run
 into phases (bench/phases.py explains how they are measured and scaled to the paper's million steps).
@@ -36,7 +36,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-# Scripts find modules beside themselves; those needed here lie in the project.
+# A script's own folder is first on the path; the imports below need the project root.
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 import torch
@@ -52,9 +52,9 @@ from tables import MISSING, Table, text_cells, to_terminal, write_csv, write_tab
 
 ALGO = {"TD3": "DPre", "SAC": "SPre"}
 TRANSITIONS = 10_000
-"""In each seed's replay buffer."""
+"""Number in each seed's replay buffer."""
 ENV_STEPS = 10
-"""Environment steps of a turn for each of its gradient steps."""
+"""Environment steps of a turn for each gradient step of a turn."""
 DEFAULTS = {
     "base": "TD3,SAC",
     "seeds": "1,2,5,10",
@@ -122,7 +122,7 @@ def environment_turn(base: str, seeds: int, steps: int) -> Turn:
 
 
 def turns(base: str, seeds: int, steps: int, peer: Peer | None) -> dict[str, Turn]:
-    """The turns, by name; "update" and "environment" are ours."""
+    """The turns by name; "update" and "environment" are this project's."""
     config = make_config(ALGO[base])
     agent = make_agent(ALGO[base], config.batch_size, range(seeds))
     replay = fill_replay(agent, TRANSITIONS)
@@ -150,7 +150,7 @@ def measure(base: str, threads: int, options: Options, cells: dict[int, dict[str
             for name, turn in list(cells[seeds].items())[::direction]:
                 steps = options.steps * (ENV_STEPS if "environment" in name else 1)
                 seconds = turn(clock) / (steps * (1 if "peer" in name else seeds))
-                if number:  # the round before the first one warms up
+                if number:  # round 0 is a warm-up
                     milliseconds[seeds][name].append(1e3 * seconds)
             bar.update()
     fixed = {"base": base, "algo": ALGO[base], "threads": threads, "rounds": options.rounds, "steps": options.steps}
@@ -160,7 +160,7 @@ def measure(base: str, threads: int, options: Options, cells: dict[int, dict[str
 
 
 def summary(milliseconds: dict[str, list[float]]) -> dict[str, Any]:
-    """Least and median time of each, and medians of the ratios within rounds; "" if it was not measured."""
+    """Least and median time of each turn, and medians of the ratios within rounds; "" for what was not measured."""
 
     def ratio(above: str, below: str) -> float | str:
         pairs = list(zip(milliseconds.get(above, []), milliseconds.get(below, []), strict=False))
@@ -279,7 +279,7 @@ def parse_arguments(arguments: Sequence[str]) -> Options:
 
 
 def measure_all(options: Options) -> None:
-    """Measure and print everything. Saves after each number of threads, and of seeds."""
+    """Measure, save and print everything. Saves after each number of threads, and after each run of the phases."""
     records: list[dict] = []
     phases: list[dict] = []
     total = len(options.bases) * len(options.threads) * len(options.seeds) * (options.rounds + 1)

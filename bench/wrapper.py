@@ -1,10 +1,11 @@
-"""What `envs.Constrained` costs: microseconds of a step with it and without.
+"""The cost of `envs.Constrained`: microseconds of a step with and without it.
 
     python bench/wrapper.py
     python bench/wrapper.py steps=2000
 
-A row for each environment and set. Suggestions are uniform in the box; their share outside the set is printed, as a
-feasible one needs no projection. The variants take turns, and a number is the median over rounds of CPU time.
+Prints a row for each environment and set. Suggested actions are uniform in the box. Their share outside the set is
+printed too, because feasible ones need no projection. The variants take turns; a number is the median CPU time over
+rounds.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ ROWS: dict[str, tuple[Callable[[], gymnasium.Env], Constraint]] = {
 
 
 def round_of(env: gymnasium.Env, steps: int) -> tuple[float, float]:
-    """Microseconds of a step, and the share of infeasible suggestions."""
+    """CPU microseconds of a step, and the share of infeasible suggestions."""
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(steps)]

@@ -39,12 +39,12 @@ class Aggregates:
     scores: Scores
     means: dict[str, Estimate]
     improvements: dict[tuple[str, str], Estimate]
-    """Of the first algorithm over the second, where they have tasks in common."""
+    """Probability that the first algorithm beats the second, for pairs with common tasks."""
     diverged: set[str]
-    """Algorithms with seeds that diverged, and count with their best parameters before."""
+    """Algorithms with diverged seeds that count with their best parameters before."""
 
     def label(self, algo: str) -> str:
-        """The name of `algo`, with a dagger where seeds diverged."""
+        """The name of `algo`, with a dagger if seeds diverged."""
         return algo + DAGGER * (algo in self.diverged)
 
 
@@ -129,9 +129,9 @@ def improvement_table(aggregates: Sequence[Aggregates]) -> Table:
 def draw_aggregates(
     aggregates: Sequence[Aggregates], own: Sequence[str], folder: Path, formats: Sequence[str]
 ) -> list[Path]:
-    """Interquartile means with profiles, and the matrix of improvements, for each combination of settings.
+    """Draw two figures for each combination of settings: interquartile means with profiles, and improvements.
 
-    `own` as in `plots.style.color_of`.
+    Returns the files. `own` as in `plots.style.color_of`.
     """
     written = []
     for aggregate in aggregates:

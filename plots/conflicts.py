@@ -1,4 +1,4 @@
-"""Runs of one task or algorithm by name that were trained on different definitions of it: kept apart, and named."""
+"""Separates and reports runs that name the same task or algorithm but were trained on different definitions of it."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _UNKNOWN = "unknown"
 
 
 def keep_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """The runs, and a line for each task and algorithm with several definitions.
+    """Separate runs whose task or algorithm has several definitions; return all runs and a line for each conflict.
 
-    Runs of those have one setting more, `task_definition` or `algorithm_definition`, which separates them in all tables
-    and figures. A run without a definition is older than definitions. It counts as one of the project's own task.
+    Such a run gets one more setting, `task_definition` or `algorithm_definition`, which separates it in all tables and
+    figures. A run without a stored definition is older than this feature. It conflicts only with a user's definition.
     """
     definitions = [read_definition(run.folder) for run in runs]
     extra: list[dict[str, str]] = [{} for _ in runs]
@@ -37,7 +37,7 @@ def keep_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
                 continue
             for i in members:
                 extra[i][f"{part}_definition"] = marks[i]
-            # The first run of each, in the order of their start.
+            # The first run of each definition, by starting time.
             members.sort(key=lambda i: str(read_info(runs[i].folder).get("started", "")))
             firsts: dict[str, int] = {}
             for i in members:

@@ -53,9 +53,9 @@ def hyperparameter_table() -> Table:
 
 
 def _configurations() -> dict[tuple[str, str], dict[str, Any]]:
-    """By group of robots and family of algorithms, every setting of any algorithm of this family.
+    """All settings by group of robots and family of algorithms.
 
-    An algorithm with another value than those before it has columns of its own name.
+    An algorithm that differs from earlier ones of its family in a value gets a column under its own name.
     """
     columns: dict[tuple[str, str], dict[str, Any]] = {}
     for group in dict.fromkeys(group for algorithm in ALGORITHMS.values() for group in algorithm.agent.paper):

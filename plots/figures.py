@@ -49,10 +49,10 @@ def learning_curve(runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def draw_curves(groups: Groups, own: Sequence[str], folder: Path, formats: Sequence[str]) -> list[Path]:
-    """A figure of learning curves for each condition, and one of training measures for each task that has any.
+    """Draw the learning curves of each condition and the training measures of each task; return the files.
 
-    The latter also shows algorithms without measures that have runs of several settings. `own` as in
-    `plots.style.color_of`.
+    A figure of training measures also shows the returns of algorithms without measures, if they have runs of several
+    settings. `own` as in `plots.style.color_of`.
     """
     conditions = list(chain.from_iterable(order_conditions(groups)))
     jobs = [partial(_draw_condition, condition, groups[condition], own) for condition in conditions]
@@ -91,7 +91,7 @@ class _Curves:
     algo: str
     runs: list[Run]
     label: str
-    style: str  # of lines
+    style: str  # line style
 
     @property
     def measures(self) -> tuple[str, ...]:
@@ -105,7 +105,7 @@ def _draw_training(
     curves, common = _label_settings(by_settings)
     several = {curve.algo for curve in curves if sum(other.algo == curve.algo for other in curves) > 1}
     curves = [curve for curve in curves if curve.measures or curve.algo in several]
-    # The order of the measures may differ: published runs have that of their file.
+    # The order of the measures may differ: published runs have the order of their file.
     rows = list({frozenset(curve.measures): curve.measures for curve in curves}.values())
     if not rows:
         return []
@@ -128,8 +128,8 @@ def _draw_training(
         for axes in others[len(measures) :]:
             axes.remove()
         for axes in (first, *others[: len(measures)]):
-            axes.tick_params(labelbottom=True)  # sharing leaves them to the last row, where a column may have no panel
-    panels[0][0].autoscale(axis="x")  # the panels share it, and the first row alone had set its end
+            axes.tick_params(labelbottom=True)  # sharex labels only the last row, which may lack a panel
+    panels[0][0].autoscale(axis="x")  # all panels share this axis, but only the first row had set its end
     panels[0][0].set_xlim(left=0)
     figure.suptitle(fill(", ".join([f"{task} (mean ± standard error)", *common]), 110))
     longest = max(len(curve.label) for curve in curves)
@@ -140,8 +140,8 @@ def _draw_training(
 def _label_settings(by_settings: dict[str, dict[str, list[Run]]]) -> tuple[list[_Curves], list[str]]:
     """The curves of a task, and the settings that all of them share.
 
-    A label has the settings that are not shared. Where an algorithm has runs of several values of a setting, it has
-    that of the default too.
+    A label names the settings that not all curves share. If an algorithm has runs with several values of a setting, the
+    label names the default value too.
     """
     words = {settings: dict.fromkeys(filter(None, settings.split(", "))) for settings in by_settings}
     common = [word for word in next(iter(words.values())) if all(word in others for others in words.values())]
@@ -183,7 +183,7 @@ def _label_axes(axes: Axes, quantity: str) -> None:
 
 
 def _legend(algo: str, runs: Sequence[Run]) -> str:
-    """The name of `algo`, and how its seeds stand: the dagger as in the tables."""
+    """The name of `algo`, with a dagger as in the tables and with notes on unfinished and diverged seeds."""
     finished, failed = sum(run.finished for run in runs), sum(bool(run.failure) for run in runs)
     name, notes = algo + DAGGER * bool(count_diverged(runs)), []
     if finished + failed < len(runs):

@@ -1,4 +1,4 @@
-"""Which runs belong together: those whose configurations differ in nothing but the seed."""
+"""Groups runs whose configurations differ only in the seed."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class Condition(NamedTuple):
 
 
 DAGGER = "†"
-"""Marks what has seeds that diverged, and count with their best parameters before."""
+"""Marks results that include diverged seeds. Such a seed counts with its best parameters before it diverged."""
 
 Groups = dict[Condition, dict[str, list[Run]]]
-"""Runs by condition and algorithm: those of one group differ in nothing but the seed."""
+"""Runs by condition and algorithm: the runs of a group differ only in the seed."""
 
 
 @dataclass
 class _Group:
-    """Runs of one configuration; `settings` are those that its label names."""
+    """Runs of one configuration by seed; `settings` are those that the label names."""
 
     task: str
     algo: str
@@ -51,15 +51,15 @@ class _Group:
 
 
 def group_runs(runs: Iterable[Run]) -> tuple[Groups, list[str]]:
-    """Group the runs that differ only in the seed, and list those that repeat another run's seed.
+    """Group the runs that differ only in the seed, and list the runs that repeat another run's configuration and seed.
 
-    Usually a run's folder name has all settings that differ from the paper's. If configurations of one label differ in
-    others (because a default changed between the runs, say), their labels name those too.
+    Usually a run's folder name has all settings that differ from the paper's. If configurations with the same label
+    differ in other settings (for example because a default changed between the runs), the labels name these too.
     """
     groups: dict[tuple, _Group] = {}
     repeated = []
     for run in runs:
-        # A setting that the algorithm does not have is None, or missing in a run that is older than the setting.
+        # A setting that the algorithm does not have is None, or missing if the run is older than the setting.
         settings = run.config.items()
         config = {key: setting_text(value) for key, value in settings if key not in RUN_KEYS and value is not None}
         key = run.task, run.algo, tuple(sorted(config.items()))
@@ -93,7 +93,7 @@ def _tell_apart(groups: Sequence[_Group]) -> None:
 
 
 def setting_text(value: Any) -> str:
-    """The value of a setting in a label."""
+    """The text of a setting's value in a label."""
     return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"), default=str)
 
 
@@ -112,12 +112,12 @@ def order_conditions(cells: Mapping[Condition, Collection[str]]) -> list[list[Co
 
 
 def place_of_settings(settings: str, cells: int) -> tuple[int, int, str]:
-    """The key that sorts combinations of settings: fewest settings first, among those the one with most cells."""
+    """The sort key of a combination of settings: fewest settings first, then most cells."""
     return len(_split_settings(settings)), -cells, settings
 
 
 def shared_settings(combinations: Iterable[str]) -> list[str]:
-    """The settings that all of `combinations` have, sorted. A table says them once, in its title."""
+    """The settings that all of `combinations` have, sorted. A table names them once, in its title."""
     sets = [set(_split_settings(settings)) for settings in combinations]
     return sorted(set.intersection(*sets)) if sets else []
 
@@ -137,9 +137,9 @@ def _split_settings(settings: str) -> list[str]:
 
 
 def final_return(run: Run) -> float | None:
-    """The mean return that the run ended with: None while it is unfinished.
+    """The final mean return of a run; None while it is unfinished.
 
-    Of a run that diverged, it is that of the best parameters before, and not finite where there is none.
+    For a run that diverged, this is the return of its best parameters before, or NaN if it has no such parameters.
     """
     if run.failure:
         result = run.failure.get("result")
@@ -185,7 +185,7 @@ def list_left_out(groups: Groups) -> list[str]:
 
 
 def list_diverged(groups: Groups) -> list[str]:
-    """A line for each cell with seeds that diverged, and count with the best parameters before."""
+    """A line for each cell with diverged seeds that count with their best parameters before."""
     lines = []
     for condition in chain.from_iterable(order_conditions(groups)):
         for algo in order_algos(groups[condition]):
@@ -199,7 +199,7 @@ def list_diverged(groups: Groups) -> list[str]:
 
 
 def count_diverged(runs: Iterable[Run]) -> int:
-    """How many of `runs` diverged, and count with the best parameters before."""
+    """How many of `runs` diverged but count, with their best parameters before."""
     return sum(bool(run.failure) and math.isfinite(final_return(run)) for run in runs)
 
 

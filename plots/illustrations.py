@@ -31,7 +31,7 @@ SET_COLOR, POINT_COLORS = "#cfe0f3", ("#b8520a", "#1e6b26")
 # Both are nearest to the same corner: the projection maps them to one point, with a gradient of zero.
 SAMPLES = ((1.16, 0.30), (1.20, -0.13))
 PANELS = 8
-"""Moments of an episode at which the feasible set is drawn."""
+"""Number of steps of an episode at which the feasible set is drawn."""
 
 
 def polygon() -> LinearConstraint:
@@ -44,7 +44,7 @@ def polygon() -> LinearConstraint:
 
 @torch.no_grad()  # coefficients may be learned
 def boundary(constraint: Constraint, obs: Tensor) -> np.ndarray:
-    """Points (1440, 2) around the boundary of a set of two dimensions at obs (n,), from its gauge."""
+    """Points (1440, 2) on the boundary of a two-dimensional set at obs (n,), computed from its gauge."""
     angles = torch.linspace(0.0, 2.0 * math.pi, 1441, dtype=torch.float64)[:-1]
     directions = torch.stack((angles.cos(), angles.sin()), -1)
     center = constraint.center(obs)
@@ -53,7 +53,7 @@ def boundary(constraint: Constraint, obs: Tensor) -> np.ndarray:
 
 
 def draw_maps(folder: Path, formats: Sequence[str]) -> list[Path]:
-    """The paper's Figure 1: what the three maps make of the same two actions."""
+    """Draw the paper's Figure 1: the images of the same two actions under three maps."""
     constraint, obs = polygon(), torch.zeros(1, dtype=torch.float64)
     center = constraint.center(obs)
     actions = torch.tensor(SAMPLES, dtype=torch.float64)
@@ -98,7 +98,7 @@ def _name_point(axes: Axes, name: str, point: Any, offset: tuple[float, float] =
 
 
 class Episode(NamedTuple):
-    """What a policy did in an episode of T steps."""
+    """Observations, actions and rewards of an episode of T steps."""
 
     obs: np.ndarray  # (T, n)
     action: np.ndarray  # (T, d), executed
@@ -108,8 +108,8 @@ class Episode(NamedTuple):
 def play(run: Run) -> Episode:
     """The first evaluation episode of the run's seed, played with its best parameters.
 
-    Raises ConfigError if the run's algorithm or task is unknown here, if its parameters are missing, damaged or of
-    another shape, and if an action is refused or the constraint breaks down.
+    Raises ConfigError if the run's algorithm or task is unknown, if its configuration is bad, if its parameters are
+    missing, damaged or of another shape, or if the environment refuses an action or the constraint fails.
     """
     if run.task not in envs.TASKS or run.algo not in ALGORITHMS:
         raise ConfigError(f"{run.folder}: {run.algo} on {run.task} is not of this project{missing_plugin(run.folder)}")
@@ -139,9 +139,9 @@ def play(run: Run) -> Episode:
 
 @torch.no_grad()
 def draw_actions(folder: Path, out: Path, formats: Sequence[str]) -> list[Path]:
-    """Feasible set and executed action at moments of an episode, and how far out the actions are throughout.
+    """Draw the feasible set and executed action at `PANELS` steps of an episode, and the gauge of every action.
 
-    Raises ConfigError if `folder` is not a run's, or if its task does not have two dimensions.
+    Raises ConfigError if `folder` is not a run's, if its task does not have two dimensions, or as `play` does.
     """
     if folder not in find_runs(folder.parent.parent.parent):
         raise ConfigError(f"{folder} is not the folder of a run (<results>/<task>/<algorithm>/seed=<n>)")

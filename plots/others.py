@@ -1,16 +1,16 @@
-"""Results of several places side by side: folders of results, published runs, and CSV files that anybody can write.
+"""Results from several sources side by side: folders of results, published runs, and CSV files of other programs.
 
-Such a file has a row for each evaluation of a run, with at least these columns:
+A CSV file has a row for each evaluation of a run, with at least these columns:
 
     task,algorithm,seed,step,return
     R+L2,Mine,0,5000,3.25
     R+L2,Mine,0,10000,7.5
 
 `step` counts environment steps, `return` is the mean return of the evaluation. The return at a run's last step is its
-result in the tables. Other columns are ignored. Names are free; those of the project's tasks and of the paper's
-algorithms stand beside the project's and the paper's own.
+result in the tables. Other columns are ignored. Any names are allowed. Results with the name of one of the project's
+tasks or the paper's algorithms appear beside the project's and the paper's own.
 
-The names of algorithms of a place with a label are `<algorithm> (<label>)`.
+If a source has a label, its algorithms are named `<algorithm> (<label>)`.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ class Source(NamedTuple):
 def parse_sources(words: Sequence[str]) -> list[Source]:
     """The sources that words `PATH` or `PATH=LABEL` name.
 
-    All but the first have a label, which is the name of the folder or the file unless another is given. Raises
-    ConfigError for a label that cannot be one, and for two that are equal.
+    Every source but the first must have a label; by default it is the name of the folder or file. Raises ConfigError
+    for an invalid label and for two equal labels.
     """
     sources: list[Source] = []
     for word in words:
         path, label = user_path(word), None
-        if "=" in word and not path.exists():  # the path of a run has a "=" itself
+        if "=" in word and not path.exists():  # the path of a run contains "=", too
             text, _, label = word.rpartition("=")
             path = user_path(text)
         elif sources:
@@ -69,7 +69,7 @@ def parse_sources(words: Sequence[str]) -> list[Source]:
 
 
 def cells_in(path: Path) -> list[tuple[str, str]]:
-    """Task and algorithm, without a label, of every run in a folder or a CSV file. ConfigError where there is none."""
+    """Task and algorithm (without label) of every run in a folder or CSV file. Raises ConfigError if there is none."""
     cells = [(folder.parent.parent.name, parse_variant(folder.parent.name)[0]) for folder in find_runs(path)]
     cells += _published(lambda: published_cells(path))
     runs, problems = _read_files(path)
@@ -81,7 +81,7 @@ def cells_in(path: Path) -> list[tuple[str, str]]:
 
 
 def read_source(source: Source, tasks: Collection[str], algos: Collection[str]) -> tuple[list[Run], list[str]]:
-    """The runs of these tasks and algorithms (without a label) in a source, and a line for each unreadable one."""
+    """The runs of these tasks and algorithms (without label) in a source, and a line for each unreadable one."""
     runs, problems = read_results(source.path, tasks, algos)
     runs += [published.run for published in _published(lambda: read_published(source.path, tasks, algos))]
     more, unreadable = _read_files(source.path)
@@ -90,7 +90,7 @@ def read_source(source: Source, tasks: Collection[str], algos: Collection[str]) 
 
 
 def _published(read: Callable[[], list[T]]) -> list[T]:
-    """What `read` returns; ConfigError for a corrupt file."""
+    """Return what `read` returns. Raises ConfigError for a corrupt file."""
     try:
         return read()
     except ValueError as error:
@@ -98,7 +98,7 @@ def _published(read: Callable[[], list[T]]) -> list[T]:
 
 
 def _read_files(path: Path) -> tuple[list[Run], list[str]]:
-    """The runs in a CSV file or in those of a folder, and a line for each file that is not in this form."""
+    """The runs in a CSV file, or in all CSV files of a folder, and a line for each file that cannot be read."""
     runs, problems = [], []
     for file in sorted(path.glob("*.csv")) if path.is_dir() else [path]:
         try:
@@ -109,7 +109,7 @@ def _read_files(path: Path) -> tuple[list[Run], list[str]]:
 
 
 def read_csv(path: Path) -> list[Run]:
-    """The runs in a CSV file. Raises a ValueError that names file, line and value for what does not fit."""
+    """The runs in a CSV file. Raises a ValueError that names the file, the line and the bad value."""
     evaluations: dict[tuple[str, str, int], dict[int, float]] = {}
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
@@ -128,7 +128,7 @@ def read_csv(path: Path) -> list[Run]:
 
 
 def _parse(row: dict[str, str | None], line: int) -> tuple[str, str, int, int, float]:
-    """The values of a row of the columns COLUMNS."""
+    """The values of a row in the columns COLUMNS. Raises ValueError for a bad value."""
     task, algo, *numbers = ((row[name] or "").strip() for name in COLUMNS)
     for name, text in (("task", task), ("algorithm", algo)):
         if not text:

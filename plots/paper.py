@@ -1,4 +1,4 @@
-"""The paper's algorithms and later methods in order, their colours here, and the paper's table of rewards."""
+"""Order and colours of the paper's algorithms and of later methods, and the paper's table of rewards."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ COLORS = {
 }
 FAMILIES = {"TD3 family": list(COLORS)[:9], "SAC family": list(COLORS)[9:]}
 LATER = {"DGauge": "#b5a100", "SGauge": "#ff6f61", "DFlow": "#4b6cb7", "SFlow": "#2e8b57", "ARAM": "#7f00ff"}
-"""The colours of the methods here that are not the paper's. Tables and figures have them apart, after the paper's."""
+"""Colours of this project's methods that are not in the paper. Tables and figures show them after the paper's."""
 BEYOND = "beyond the paper"
-"""The heading above these methods and those of one's own."""
-# Without constraints a penalty is zero and a projection the identity, so the paper trains one of each family.
+"""The heading above all algorithms that are not the paper's: `LATER` and the user's own."""
+# Without constraints, penalties are zero and projections the identity. These algorithms coincide, and the paper trains
+# one of each family.
 UNCONSTRAINED = "R+N"
 SAME_WITHOUT_CONSTRAINT = dict.fromkeys(("DPro+", "DPre", "DPre+", "DOpt", "DOpt+"), "DPro") | {"SPre+": "SPre"}
 PAPER_SEEDS = 10
@@ -60,14 +61,14 @@ def order_tasks(names: Iterable[str]) -> list[str]:
 
 
 def order_algos(names: Iterable[str]) -> list[str]:
-    """The algorithms in the paper's order, then `LATER`, then other ones; those with a label follow the one without."""
+    """The algorithms in the paper's order, then `LATER`, then others; a labelled name follows the unlabelled one."""
     return _order(names, [*COLORS, *LATER])
 
 
 def first_beyond(ordered: Sequence[str]) -> int | None:
-    """The place in `ordered` (`order_algos`) of the first algorithm that is not the paper's.
+    """The index in `ordered` (from `order_algos`) of the first algorithm that is not the paper's.
 
-    None where all or none of them are the paper's, so that there are no two groups.
+    None if all or none of them are the paper's, because there are no two groups to separate.
     """
     papers = sum(unlabelled(name) in COLORS for name in ordered)
     return papers if 0 < papers < len(ordered) else None
@@ -79,7 +80,7 @@ def _order(names: Iterable[str], known: Iterable[str]) -> list[str]:
 
 
 def labelled(algo: str, label: str) -> str:
-    """The name of `algo` in the results of another place, which has a label (plots/others.py)."""
+    """The name of `algo` in results of a source with this label (plots/others.py); unchanged if `label` is empty."""
     return f"{algo} ({label})" if label else algo
 
 
@@ -89,7 +90,7 @@ def unlabelled(algo: str) -> str:
 
 
 def same_without_constraint(algo: str) -> str | None:
-    """The algorithm that trains for `algo` on R+N in the same results; None where that is `algo` itself."""
+    """The algorithm, with the same label, whose runs stand for `algo` on R+N; None if `algo` trains there itself."""
     name = unlabelled(algo)
     same = SAME_WITHOUT_CONSTRAINT.get(name)
     return same and same + algo.removeprefix(name)

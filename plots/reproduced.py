@@ -1,6 +1,6 @@
-"""The tables of what was trained at full length, in README and docs/results.md: `python -m plots.reproduced`.
+"""Writes the tables of full-length results in README and docs/results.md: `python -m plots.reproduced`.
 
-It reads docs/data and replaces both tables. A test compares them with the data.
+It reads docs/data and replaces both tables. A test compares the tables with the data.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ Cells = dict[str, dict[str, list[Run]]]
 def read_cells(root: str | Path) -> Cells:
     """The runs published in `root` that have the paper's own settings and a final result.
 
-    A run that diverged has that of the best parameters before.
-    Raises ValueError if a file is corrupt, a run repeats another, or a cell mixes settings.
+    The result of a diverged run is that of its best parameters before. Raises ValueError if a file is corrupt, a run
+    repeats another, or a cell mixes settings.
     """
     runs = [published.run for published in read_published(root)]
     groups, repeated = group_runs(run for run in runs if not run.overrides and _has_result(run))
@@ -42,9 +42,10 @@ def read_cells(root: str | Path) -> Cells:
 
 
 def overview(cells: Cells) -> str:
-    """README's table of the paper's algorithms: a row a map, a column each for TD3 and SAC on a task, our mean first.
+    """README's table of the paper's algorithms: a row for each map, columns for TD3 and SAC on each task.
 
-    The first letter of a name is that of its base, D or S; the rest is its map. NFW stands alone, beside TD3's.
+    A cell has our mean, then the paper's. The first letter of an algorithm's name is its base (D for TD3, S for SAC),
+    the rest is its map. NFW has a row of its own, in TD3's columns.
     """
     found: dict[tuple[str, str], dict[str, str]] = {}
     paper = {algo for by_algo in cells.values() for algo in by_algo if algo in COLORS}
@@ -63,9 +64,9 @@ def overview(cells: Cells) -> str:
 
 
 def details(cells: Cells) -> str:
-    """The table of docs/results.md: a row a cell, with the results on Reacher adjusted for their starts.
+    """The table of docs/results.md: a row for each cell, with results on Reacher also adjusted for their starts.
 
-    The difference to the paper is that of the adjusted result, where there is one, in joint standard errors.
+    The difference from the paper is in joint standard errors. It uses the adjusted result if there is one.
     """
     rows = [
         ["task", "algorithm", "seeds", "final result", "adjusted", "paper", "difference", "largest violation"],
@@ -97,7 +98,7 @@ def _results(runs: Sequence[Run]) -> Statistic:
 
 
 def _mark(runs: Sequence[Run]) -> str:
-    """A dagger where seeds diverged."""
+    """A dagger if seeds diverged."""
     return DAGGER * bool(count_diverged(runs))
 
 
@@ -118,11 +119,11 @@ def _markdown(rows: Sequence[Sequence[str]]) -> str:
 
 
 TABLES = {ROOT / "README.md": overview, ROOT / "docs" / "results.md": details}
-"""The table of each document."""
+"""The function that makes the table of each document."""
 
 
 def replace_table(text: str, table: str) -> str:
-    """`text` with `table` between its two marks. Raises ValueError if it does not have them."""
+    """`text` with `table` between the two marks. Raises ValueError if a mark is missing."""
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:

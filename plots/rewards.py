@@ -1,4 +1,4 @@
-"""The paper's table of rewards, and the comparison of ours with it."""
+"""Our results in the form of the paper's table of rewards, and their comparison with the paper's."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ from tables import MISSING, Table, TableCell, text_cells
 
 
 def best_of_row(means: dict[str, float]) -> set[str]:
-    """The names with the three highest means, or of three or fewer the one with the highest, and any that ties."""
+    """The names with the three highest means, or of three or fewer names the highest mean; ties are included."""
     ranked = sorted(means.values(), reverse=True)
     return {name for name, mean in means.items() if mean >= ranked[2 if len(ranked) > 3 else 0]}
 
 
 def decimals(values: Iterable[float]) -> int:
-    """As in the paper: two for Reacher's returns of some tens, none for returns of hundreds and thousands."""
+    """Number of decimals, as in the paper: two if all values are below 100 in size (Reacher), otherwise none."""
     return 2 if max(abs(value) for value in values) < 100 else 0
 
 
 def reward_table(groups: Groups, beside: bool = False) -> Table:
     """The paper's table: mean and standard error, the best of a row bold, the number of seeds unless it is ten.
 
-    It has the columns of the algorithms with results and, if `beside`, the paper's own columns beside them.
+    It has a column for each algorithm with results and, if `beside`, the paper's own columns too.
     """
     statistics, paper = reward_statistics(groups), read_paper() if beside else {}
     printed = {algo: stat for (*_, algo), stat in paper.items()}
@@ -93,14 +93,17 @@ def reward_table(groups: Groups, beside: bool = False) -> Table:
     for name, family in FAMILIES.items():
         if count := sum(unlabelled(head) in family for head in header):
             spans[name] = count
-    # The others stand last (order_algos). With no heading, they would seem to be of neither family.
+    # The other algorithms come last (order_algos). They need a heading too: they are in neither family.
     if others := len(header) - 1 - sum(spans.values()):
         spans[BEYOND] = others
     return Table("rewards", title, header, 1, sections, records, spans)
 
 
 def _columns(statistics: Mapping[Condition, Mapping[str, Statistic]], printed: Iterable[str]) -> list[str]:
-    """The algorithms with a column: those with results, those that the paper has, and those that a row has twice."""
+    """The algorithms with a column: those with results and those in `printed`.
+
+    If `printed` is empty, algorithms that coincide with one of these on R+N have a column too.
+    """
     algos = {*printed, *(algo for row in statistics.values() for algo in row)}
     for condition, row in statistics.items():
         if condition.task == UNCONSTRAINED and not printed:
@@ -116,7 +119,7 @@ def describe(stat: Statistic, digits: int) -> tuple[str, ...]:
 
 
 def _our_lines(stat: Statistic, digits: int, runs: Sequence[Run]) -> tuple[str, ...]:
-    """The lines of our cell: a dagger and a note where seeds diverged, a note where some have no result."""
+    """The lines of our cell, with a dagger and a note if seeds diverged, and a note if seeds have no finite result."""
     value, *others = describe(stat, digits)
     failed, diverged = count_failed(runs), count_diverged(runs)
     if diverged:
@@ -125,10 +128,10 @@ def _our_lines(stat: Statistic, digits: int, runs: Sequence[Run]) -> tuple[str, 
 
 
 def comparison_table(groups: Groups) -> Table:
-    """Our results beside the paper's, where the paper has the cell. It is empty where it has none of them.
+    """Our results beside the paper's. The table is empty if the paper has none of the cells.
 
-    Only the batch size chooses the paper's row. Runs with other settings are compared too; the label or the title has
-    those.
+    Only the batch size selects the paper's row. Runs with other changed settings are compared too; the row's label or
+    the title names these settings.
     """
     statistics, paper = reward_statistics(groups), read_paper()
     shared = shared_settings(condition.settings for condition in statistics)

@@ -1,4 +1,4 @@
-"""The paper's runtime experiment, from the file of `bench/runtime.py`: a table and the bars of the figure."""
+"""Table and bar chart of the paper's runtime experiment, from the file that `bench/runtime.py` writes."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from tables import MISSING, Table, text_cells
 
 COLUMNS = ("task", "algo", "batch", "trial", "seeds", "steps", "machine", "cpu_seconds", "gpu_seconds")
 FIXED = ("task", "seeds", "steps", "machine")
-"""Columns that do not differ within one measurement."""
+"""Columns with one value in the whole file."""
 BATCHES = (1, 16, 100)
-"""The paper's bars."""
+"""The batch sizes in the paper's figure."""
 
 Seconds = dict[tuple[str, int], list[tuple[float, float]]]
-"""CPU and GPU seconds of the trials of each algorithm and batch size."""
+"""(algorithm, batch size) -> CPU and GPU seconds of each trial."""
 
 
 def read_runtime(path: Path) -> list[dict]:
-    """The rows of the file, with numbers parsed. Raises ConfigError for another kind of file and for an empty one."""
+    """The rows of the file, with numbers parsed. Raises ConfigError if it is of another kind, empty or inconsistent."""
     if not path.is_file():
         raise ConfigError(f"{path} is not a file (bench/runtime.py makes it)")
     with open(path, newline="", encoding="utf-8") as file:
@@ -67,7 +67,7 @@ def _title(records: Sequence[dict], seconds: Seconds) -> str:
 
 
 def runtime_table(path: Path) -> Table:
-    """Seconds, CPU and GPU together, of each algorithm by batch size: mean and standard error over trials."""
+    """CPU plus GPU seconds of each algorithm and batch size: mean and standard error over trials."""
     records = read_runtime(path)
     seconds = _by_cell(records)
     batches = sorted({batch for _, batch in seconds})
@@ -84,7 +84,7 @@ def _text(stat: Statistic) -> str:
 
 
 def draw_runtime(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
-    """Bars of each algorithm for the paper's batch sizes, or for all measured sizes if none of those is measured."""
+    """Draw bars of each algorithm for the paper's batch sizes, or for all measured sizes if the paper's are missing."""
     records = read_runtime(path)
     seconds = _by_cell(records)
     measured = sorted({batch for _, batch in seconds})

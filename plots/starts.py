@@ -1,9 +1,9 @@
 """Returns on Reacher without the luck of their starts.
 
-How far the target is from the fingertip at the start explains most of a return on Reacher. The part of this distance
-that the arm can make up, times 100, is the *gain* of a start: the reward is 100 times the progress towards the target,
-minus small costs. The starts of a run's final episodes follow from its seed, so their gains are known. The mean gain of
-all possible starts is known too. The adjusted return, which is return - gain + mean gain, has the same expectation as
+Most of a return on Reacher depends on the distance between fingertip and target at the start. The reward is 100 times
+the progress towards the target, minus small costs. The *gain* of a start is 100 times the part of this distance that
+the arm can cover. The seed of a run determines the starts of its final episodes, so their gains are known. The mean
+gain of all possible starts is known too. The adjusted return, return - gain + mean gain, has the same expectation as
 the return and a smaller variance (a control variate with coefficient 1).
 """
 
@@ -25,7 +25,7 @@ from store.folder import Run
 from tables import MISSING, Table, text_cells
 
 POINTS = 2**14
-"""Starts that the mean gain is the mean of. They are spread evenly (Sobol), and its error is some 0.001."""
+"""Number of starts in the mean gain, spread evenly (Sobol). The error of the mean is about 0.001."""
 
 
 def gains(obs: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def gains(obs: np.ndarray) -> np.ndarray:
 
 
 class _Spread(np.random.Generator):
-    """In the place of a random generator, it draws the coordinates of evenly spread points, one after the other."""
+    """Replaces a random generator: draws the coordinates of evenly spread points, one after the other."""
 
     def __init__(self, points: np.ndarray):
         super().__init__(np.random.PCG64(0))
@@ -50,7 +50,7 @@ class _Spread(np.random.Generator):
 
 @cache
 def mean_gain(points: int = POINTS) -> float:
-    """The mean gain of all starts."""
+    """The mean gain of all possible starts, estimated from `points` starts."""
     robot, draws = Reacher(), _Spread(qmc.Sobol(4, scramble=False).random(points))
     return float(gains(np.array([robot.reset(draws) for _ in range(points)])).mean())
 
@@ -59,7 +59,7 @@ def mean_gain(points: int = POINTS) -> float:
 def final_gains(task: str, seed: int, evaluations: int, parallel: int, episodes: int) -> np.ndarray:
     """The gains (episodes,) of the starts of a run's final episodes, in the order of its returns.
 
-    The run has evaluated its policy `evaluations` times before, in `parallel` environments. They reset together.
+    Before them, the run has evaluated its policy `evaluations` times, in `parallel` environments that reset together.
     """
     starts = []
     for k in range(parallel):
@@ -82,9 +82,9 @@ def is_on_reacher(run: Run) -> bool:
 
 
 def adjusted_table(groups: Groups) -> Table:
-    """Plain and adjusted returns of the cells on Reacher, over seeds, and how far a seed's final episodes scatter.
+    """Plain and adjusted returns of the cells on Reacher, over seeds, and the standard error of a seed's episodes.
 
-    Seeds that diverged are left out, as their starts are not known; a note says how many.
+    Diverged seeds are left out because their starts are not known; a note says how many.
     """
     rows_of = {condition for condition, by_algo in groups.items() if any(map(is_on_reacher, chain(*by_algo.values())))}
     shared = shared_settings(condition.settings for condition in rows_of)

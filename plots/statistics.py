@@ -1,9 +1,9 @@
 """Aggregates over tasks (Agarwal et al. 2021): interquartile mean, performance profile, probability of improvement.
 
 Scores are returns divided by the best mean of the task's row in the paper's table (its own batch size): 0 is a return
-of zero, 1 the paper's best algorithm on that task. A task counts for an algorithm that has at least two finished
-runs on it. Intervals are 95 % percentile intervals of SciPy's bootstrap with the tasks as strata: seeds are resampled
-within each task.
+of zero, 1 the paper's best algorithm on that task. A task counts for an algorithm with at least two finished runs on
+it. Intervals are 95 % percentile intervals of SciPy's bootstrap with the tasks as strata: seeds are resampled within
+each task.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ RESAMPLES = 2_000
 CONFIDENCE = 0.95
 
 Scores = dict[str, dict[str, np.ndarray]]
-"""Scores of the finished runs, algorithm -> task -> (n,); a failed run is -inf, below any other."""
+"""Scores of the finished runs, algorithm -> task -> (n,). A failed run has -inf, below all others."""
 
 
 class Estimate(NamedTuple):
@@ -41,13 +41,13 @@ class Estimate(NamedTuple):
 
 
 def reference(task: str) -> float | None:
-    """The return that is a score of 1; None for a task that the paper does not have."""
+    """The return that corresponds to a score of 1; None for a task that the paper does not have."""
     means = [stat.mean for (name, batch, _), stat in read_paper().items() if (name, batch) == (task, DEFAULT_BATCH)]
     return max(means, default=None)
 
 
 def normalised_scores(groups: Groups) -> dict[str, Scores]:
-    """Scores by settings. On R+N some algorithms coincide: one without runs takes the other's scores."""
+    """Scores by settings. On R+N some algorithms coincide: an algorithm without runs there gets the other's scores."""
     by_settings: dict[str, Scores] = defaultdict(lambda: defaultdict(dict))
     for condition, by_algo in groups.items():
         if (unit := reference(condition.task)) is None:
@@ -70,7 +70,7 @@ def normalised_scores(groups: Groups) -> dict[str, Scores]:
 
 
 def comparable(scores: Scores) -> dict[tuple[str, ...], list[str]]:
-    """Algorithms by the tasks that they have scores on, because aggregates compare over the same tasks only."""
+    """Algorithms grouped by their scored tasks, most tasks first: aggregates compare over the same tasks only."""
     by_tasks: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for algo, by_task in scores.items():
         by_tasks[tuple(by_task)].append(algo)
@@ -96,7 +96,7 @@ def performance_profile(by_task: dict[str, np.ndarray], thresholds: np.ndarray) 
 
 
 def probability_of_improvement(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> Estimate:
-    """Probability that a run of the first scores above one of the second, ties half, mean over their common tasks."""
+    """Probability that a run of `first` beats a run of `second` (ties count half), mean over their common tasks."""
     tasks = [task for task in first if task in second]
 
     def statistic(*samples: np.ndarray, axis: int) -> np.ndarray:
@@ -107,7 +107,7 @@ def probability_of_improvement(first: dict[str, np.ndarray], second: dict[str, n
 
 
 def _chance_above(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """P(x > y) + P(x = y) / 2 of samples (..., n) and (..., m), without the p-values that SciPy would compute too."""
+    """P(x > y) + P(x = y) / 2 of samples (..., n) and (..., m). SciPy's test would compute p-values too."""
     x, y = x[..., :, None], y[..., None, :]
     return ((x > y).mean((-2, -1)) + (x >= y).mean((-2, -1))) / 2
 

@@ -1,4 +1,4 @@
-"""How every figure looks, and how it is saved."""
+"""The common look of all figures, and how they are saved."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ OWN_COLORS = (
     "#d2a679",
 )
 OWN_LINES = ("dashdot", "dotted", (0, (5, 1, 1, 1, 1, 1)))
-"""Colours and lines of algorithms of one's own. Those of one folder of results take them in turn."""
+"""Colours and line styles of the user's own algorithms, which take them in turn."""
 
 
 def own_algos(algos: Iterable[str]) -> list[str]:
-    """The names among `algos` that have no colour yet, in a fixed order; `color_of` and `line_of` take it."""
+    """The user's own algorithms among `algos`, sorted: the argument `own` of `color_of` and `line_of`."""
     return sorted({algo for algo in algos if algo not in COLORS and algo not in LATER})
 
 
 def color_of(algo: str, own: Sequence[str]) -> str:
-    """The colour of `algo`; `own` are the algorithms of one's own in the folder of results (`own_algos`)."""
+    """The colour of `algo`; `own` are all of the user's own algorithms in the results (`own_algos`)."""
     return (COLORS | LATER).get(algo) or OWN_COLORS[own.index(algo) % len(OWN_COLORS)]
 
 
 def line_of(algo: str, own: Sequence[str], points: int) -> dict[str, Any]:
-    """Keywords of a line through so many points; `own` as in `color_of`."""
+    """Keyword arguments of `Axes.plot` for a line through `points` points; `own` as in `color_of`."""
     if algo in COLORS or algo in LATER:
         line: Any = "dashed" if algo in (*FAMILIES["SAC family"], "SGauge", "ARAM") else "solid"
     else:
@@ -55,9 +55,9 @@ def line_of(algo: str, own: Sequence[str], points: int) -> dict[str, Any]:
 
 
 def legend_handles(axes: Axes, algos: Sequence[str]) -> list[Any]:
-    """The handles of a legend of `axes`, whose labelled lines are those of `algos` in the order of `order_algos`.
+    """The handles of a legend of `axes`, which has a labelled line for each of `algos`, in the order of `order_algos`.
 
-    A heading stands above the algorithms that are not the paper's.
+    If only some of the algorithms are the paper's, a heading stands above the others.
     """
     handles = axes.get_legend_handles_labels()[0]
     if place := first_beyond(algos):
@@ -66,17 +66,20 @@ def legend_handles(axes: Axes, algos: Sequence[str]) -> list[Any]:
 
 
 def plain(axes: Axes) -> None:
-    """A light grid, and no frame on top and on the right."""
+    """Add a light grid; remove the frame on top and on the right."""
     axes.grid(alpha=0.3)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def save(figure: Figure, folder: Path, name: str, formats: Sequence[str]) -> list[Path]:
-    """Save as `folder/name` in the `formats` of figures. Characters that are awkward in a file name become _."""
+    """Save as `folder/name` in all image formats among `formats`, and return the files.
+
+    Characters that are awkward in a file name become _. A name that is too long is cut and gets a checksum.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"[^\w+,=.\[\]-]+", "_", name)
-    if len(os.fsencode(name)) > LONGEST_NAME - len(".png"):  # with a checksum, as the names of runs are told apart
+    if len(os.fsencode(name)) > LONGEST_NAME - len(".png"):  # the checksum keeps cut names apart
         name = f"{name[:50]},{hashlib.sha256(name.encode()).hexdigest()[:12]}"
     paths = [folder / f"{name}.{suffix}" for suffix in formats if suffix in FORMATS]
     for path in paths:

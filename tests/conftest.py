@@ -1,9 +1,9 @@
-"""One thread a process, as the processes share the cores, and Hypothesis profiles: few examples by default,
-`HYPOTHESIS_PROFILE=long` for 1,000 a property."""
+"""Sets one thread for each test process, because the processes share the cores, and Hypothesis profiles: few examples
+by default, `HYPOTHESIS_PROFILE=long` for 1,000 examples of each property."""
 
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before PyTorch is imported; the processes that tests start inherit it
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before PyTorch is imported; child processes inherit it
 
 import pytest
 import torch
@@ -24,14 +24,14 @@ torch.set_num_threads(1)
 
 @pytest.fixture(autouse=True)
 def denormal_numbers():
-    """Training flushes them to zero in the whole process; the tests after it may need them."""
+    """Restores denormal numbers. Training flushes them to zero in the whole process, but later tests may need them."""
     yield
     torch.set_flush_denormal(False)
 
 
 @pytest.fixture(scope="session")
 def unbroken(tmp_path_factory):
-    """The outcome of the cell `CHECKPOINTED`, trained without an interruption."""
+    """The outcome of the cell `CHECKPOINTED` after an uninterrupted training."""
     root = tmp_path_factory.mktemp("unbroken")
     train(root, CHECKPOINTED)
     return outcome(root)
@@ -39,7 +39,7 @@ def unbroken(tmp_path_factory):
 
 @pytest.fixture
 def small_flows(monkeypatch):
-    """Flows see few states, and train for 20 steps where a command does not say how many."""
+    """Flows see few states, and train for 20 steps unless a command sets another number."""
     monkeypatch.setattr(flows, "STATES", 400)
     monkeypatch.setattr(flow_training, "HELD_OUT", 100)
     monkeypatch.setattr(flow_training, "POOL", 500)

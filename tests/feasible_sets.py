@@ -1,4 +1,4 @@
-"""The feasible sets that tests of constraints share, and observations and actions for them."""
+"""Feasible sets for the tests of constraints, with observations and actions for them."""
 
 from __future__ import annotations
 
@@ -124,8 +124,8 @@ TASKS = {
     "H+O+S": Task(WeightedL1AndEllipse(velocities, 10.0, squared_sines, 0.1, 3), reference_both),
     "W+M": Task(WeightedPositivePart(velocities, 10.0, 6), reference_positive(10.0), linear=True),
     "W+O+S": Task(WeightedL1AndEllipse(velocities, 10.0, squared_sines, 0.1, 6), reference_both),
-    # Beyond the paper: the disc as an ellipse, and an ellipse that the box cuts; the degenerate angles below make some
-    # or all s_i = 0.
+    # Not in the paper: the disc as an ellipse, and an ellipse that the box cuts. The degenerate angles below make some
+    # or all s_i zero.
     "disc": Task(DiagonalEllipse(ones, 0.05, 2), lambda w, theta: ReferenceSet(*no_rows(2), np.eye(2), 0.05)),
     "cut ellipse": Task(
         DiagonalEllipse(squared_sines, 0.4, 4),
@@ -157,7 +157,7 @@ def sample_action(task: Task, count: int, seed: int, scale: float = 1.0) -> Tens
 
 
 def interior_point(task: Task, obs: Tensor, seed: int) -> Tensor:
-    """Any interior points (..., d), not the centre."""
+    """Arbitrary interior points (..., d), other than the centre."""
     point = task.constraint.radial_map(obs, sample_action(task, len(obs), seed))
     return 0.9 * point
 
@@ -218,8 +218,8 @@ SHAPES = [  # dim, rows, ellipses, rank, scale
 
 
 def random_set(dim: int, rows: int, ellipses: int, rank: int, scale: float, seed: int, batch: int = 4) -> Constraint:
-    """A set around a random point of the box, rows of norm 1e-2 to 1e4, ellipses of `rank` and size `scale`; a row in
-    eight goes right past the point."""
+    """A set around a random point of the box, with rows of norm 1e-2 to 1e4 and ellipses of rank `rank` and size
+    `scale`. One row in eight passes very close to the point."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""What several test modules use: short trainings, their outcomes, and invented runs."""
+"""Helpers of several test modules: short trainings, their outcomes, and invented runs."""
 
 import json
 
@@ -18,7 +18,7 @@ from sweep.definition import define
 from sweep.train import train as train_cell
 
 run_command = run.main
-"""What `python run.py` does with a list of words; the exit code."""
+"""Does the same as `python run.py` with a list of words; returns the exit code."""
 
 
 CHECKPOINTED = (
@@ -42,24 +42,24 @@ class Breaks:
 
 
 def cells_of(words):
-    """The cells that the words of a command ask for."""
+    """The cells that the words of a command define."""
     return make_cells(parse_words(words.split() if isinstance(words, str) else words, setting_keys()))
 
 
 def config_of(words):
-    """The configuration of the only cell that the words of a command ask for."""
+    """The configuration of the only cell that the words of a command define."""
     (cell,) = cells_of(words)
     return cell.config
 
 
 def train(root, words, stop_if_asked=lambda: None):
-    """Train the cell of `words` below `root`; whether every seed has a result."""
+    """Train the cell of `words` below `root`. Returns whether every seed has a result."""
     (cell,) = cells_of(f"{words} results={root}")
     return train_cell(cell, define(cell.config.env, cell.config.algo), stop_if_asked)
 
 
 def train_through(root, words, check):
-    """Start the same command again until it comes to its end; the number of times that it was interrupted."""
+    """Repeat the same training until it finishes. Returns the number of interruptions."""
     interrupted = 0
     while True:
         try:
@@ -70,12 +70,12 @@ def train_through(root, words, check):
 
 
 def outcome(root):
-    """Everything that a cell leaves but times, by seed."""
+    """All results and files of a cell, except times, by seed folder."""
     return {folder.name: outcome_of(folder) for folder in find_runs(root)}
 
 
 def outcome_of(folder):
-    """The same of one run."""
+    """All results and files of one run, except times."""
     result = read_run(folder).result
     result.pop("seconds")
     evaluations = [line.rpartition(",")[0] for line in (folder / "evaluations.csv").read_text().splitlines()]
@@ -100,14 +100,14 @@ def assert_identical(one, other):
 
 
 def assert_never_apart(root):
-    """Wherever seeds 3 and 5 resumed, they did so from the same moment."""
+    """Assert that seeds 3 and 5 were always started and resumed together."""
     for folder in root.glob("*/*/seed=[35]"):
         info = json.loads((folder / "info.json").read_text())
         assert all(start["lockstep"] == [3, 5] for start in [info, *info.get("resumed", [])])
 
 
 def refused_by_plot(capsys, *arguments):
-    """The one line with which plot.py refuses `arguments`."""
+    """The error message, one line, with which plot.py refuses `arguments`."""
     assert plot.main([str(argument) for argument in arguments]) == 2
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1
@@ -116,7 +116,7 @@ def refused_by_plot(capsys, *arguments):
 
 
 def write_run(root, task, algo, seed, result=None, overrides=None, evaluations=4, base=0.0, **config):
-    """A run with `evaluations` evaluations, finished with the mean return `result` unless that is None."""
+    """Write a run with `evaluations` evaluations. It is finished with the mean return `result`, unless that is None."""
     overrides = overrides or {}
     folder = run_folder(root, task, variant_name(algo, overrides), seed)
     settings = {
@@ -138,7 +138,7 @@ def write_run(root, task, algo, seed, result=None, overrides=None, evaluations=4
 
 
 def break_off(root, calls=100):
-    """Run the command up to a crash, which leaves two checkpoints a seed; those seeds' folders."""
+    """Run the command up to a crash that leaves two checkpoints for each seed. Returns the seeds' folders."""
     with pytest.raises(ZeroDivisionError):
         train(root, CHECKPOINTED, Breaks(calls, error=ZeroDivisionError()))
     folders = sorted(root.glob("*/*/seed=?"))

@@ -1,7 +1,7 @@
 """Independent references for the feasible sets: explicit rows and matrices, general solvers, optimality conditions.
 
-Nothing here uses the package. A set is given by everything written out: each of its 2^d or so rows, and its matrix.
-An interior-point solver says what the answer is, to about 1e-6; the optimality conditions say so to rounding.
+Nothing here uses the package. A set is given explicitly: all its rows, up to 2^d, and its matrix. An interior-point
+solver gives the answer to about 1e-6; the optimality conditions verify an answer up to rounding.
 """
 
 from __future__ import annotations
@@ -47,19 +47,20 @@ class ReferenceSet:
     def normal_cone_residual(self, point: np.ndarray, outward: np.ndarray, near: float = 1e-10) -> float:
         """Distance of `outward` to the normal cone at the feasible `point`; constraints within `near` are active.
 
-        A point is the projection of x where x - point is in its normal cone, and maximises <g, .> where g is. A
-        residual r leaves it within |r| of the true projection: it is that of x - r, and projections do not expand.
+        A point is the projection of x if x - point is in the normal cone at the point, and it maximises <g, .> if g is.
+        With a residual vector r, the point is the projection of x - r. Projections do not expand distances, so it is
+        within |r| of the projection of x.
         """
         return float(np.linalg.norm(self._normal_cone_remainder(point, outward, near)))
 
     def oracle_gap(self, point: np.ndarray, gradient: np.ndarray, near: float = 1e-10) -> float:
-        """Bound on how much better than the feasible `point` another one may be for <gradient, .>.
+        """Upper bound of <gradient, a - point> over all feasible a, for a feasible `point`.
 
-        The gradient is a normal plus a remainder, which gains at most its entries times the widths of the set.
+        The gradient is a normal plus a remainder. The remainder gains at most its entries times the widths of the set.
         """
         widths = np.full(self.dim, 2.0)
         if self.matrix is not None:
-            # An ellipse's half-width along an axis, if it is diagonal; else the box's.
+            # The half-width of a diagonal ellipse along an axis; for other ellipses, that of the box.
             diagonal = np.diag(self.matrix)
             if np.array_equal(self.matrix, np.diag(diagonal)):
                 widths = 2.0 * np.minimum(1.0, np.sqrt(self.matrix_bound / np.maximum(diagonal, self.matrix_bound)))

@@ -1,6 +1,6 @@
-"""A folder of results as the whole benchmark leaves it, written by the real writer with invented returns.
+"""Writes a folder of results like that of the whole benchmark, with the real writer and invented returns.
 
-python tests/synthetic.py DIR        13 algorithms x 16 conditions x 10 seeds, to measure plot.py on
+python tests/synthetic.py DIR        13 algorithms x 16 conditions x 10 seeds, to measure the time of plot.py
 """
 
 import sys
@@ -22,9 +22,9 @@ CONDITIONS = list(dict.fromkeys((task, batch) for task, batch, _ in read_paper()
 
 
 def write_results(root, conditions=CONDITIONS, algos=tuple(COLORS), seeds=10, evaluations=None):
-    """Finished runs of `algos` under `conditions` (task, batch), returns normal around the paper's mean.
+    """Write finished runs of `algos` under `conditions` (task, batch), with normal returns around the paper's mean.
 
-    `evaluations`: so many a run instead of all.
+    `evaluations`: the number of evaluations of each run; None for the full number.
     """
     rng = np.random.default_rng(0)
     for task, batch in tqdm(conditions, disable=None):

@@ -1,4 +1,4 @@
-"""Numbers of gradient steps that are drawn many steps ahead are those that the steps would have drawn themselves."""
+"""Random numbers drawn many gradient steps ahead equal the numbers that each step would have drawn itself."""
 
 import pytest
 import torch
@@ -73,7 +73,7 @@ def test_a_stream_that_is_put_back_draws_the_same_again():
     for streams in (plain, ahead):
         streams.load_state(1, saved)
     assert all(torch.equal(plain.state(i), ahead.state(i)) for i in range(len(SEEDS)))
-    for number in range(21, 21 + BLOCK):  # another kind than the one that was next
+    for number in range(21, 21 + BLOCK):  # not the kind that was expected next
         for one, other in zip(step(plain, kinds, number), step(ahead, kinds, number), strict=True):
             assert torch.equal(one, other)
 

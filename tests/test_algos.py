@@ -1,4 +1,4 @@
-"""Inside the algorithms: each gradient of each name against the paper's formula, written out seed by seed."""
+"""Gradients of all algorithms against the paper's formulas, written out seed by seed."""
 
 from copy import deepcopy
 from dataclasses import replace
@@ -17,13 +17,13 @@ SEEDS, OBS, DIM, BATCH = [3, 8], 3, 2, 12
 CONSTRAINT = WeightedPositivePart(lambda obs: 2.0 * obs[..., :DIM] + 3.0, 0.8, DIM)  # its centre is not the origin
 TD3_NAMES = [name for name, algorithm in ALGORITHMS.items() if algorithm.agent.family == "TD3"]
 SAC_NAMES = [name for name, algorithm in ALGORITHMS.items() if algorithm.agent.family == "SAC"]
-NAMES = TD3_NAMES + SAC_NAMES  # another algorithm has a test module of its own
+NAMES = TD3_NAMES + SAC_NAMES  # ARAM has its own test module
 CASES = [(name, False) for name in NAMES] + [(name, True) for name in SAC_NAMES]
 IDS = [name + (" with gSDE" if gsde else "") for name, gsde in CASES]
 
 
 def make_agent(name, gsde=False, constraint=CONSTRAINT, seeds=SEEDS, **settings):
-    """An agent with small networks whose outputs are not small, so that maps and clips all matter."""
+    """An agent with small networks whose outputs are large enough for all maps and clips to matter."""
     algorithm = ALGORITHMS[name]
     paper = algorithm.paper_config(name, "W+M", "Reacher" if gsde else "Others", steps=1)
     settings = {"gamma": 0.9, "hidden": [8, 8], "tau": 0.1} | settings
@@ -47,18 +47,18 @@ def make_agent(name, gsde=False, constraint=CONSTRAINT, seeds=SEEDS, **settings)
         for parameter in [p for module in agent.networks().values() for p in module.parameters()]:
             parameter.add_(0.4 * torch.randn(parameter.shape, generator=generator))
         for critic in (agent.critic, agent.critic_target):
-            critic.net.layers[-1].bias[len(seeds) :] -= 1.1  # so that now one, now the other is the smaller
+            critic.net.layers[-1].bias[len(seeds) :] -= 1.1  # so that either critic can be the smaller one
     return agent
 
 
 def make_batch(seed=0):
-    """Transitions with ends and time limits, stored actions of any kind, and stored centres that no formula gives."""
+    """Transitions with ends and time limits, any stored actions, and stored centres that no formula would compute."""
     generator = torch.Generator().manual_seed(seed)
     obs, next_obs = (torch.randn(len(SEEDS), BATCH, OBS, generator=generator) for _ in range(2))
     action = torch.rand(len(SEEDS), BATCH, DIM, generator=generator) * 2 - 1
     reward = torch.randn(len(SEEDS), BATCH, generator=generator)
     terminated = (torch.arange(BATCH) % 3 == 0).float().expand(len(SEEDS), -1)
-    # Interior, as the origin and the Chebyshev centre are, but neither of the two.
+    # Interior points other than the origin and the Chebyshev centre.
     center, next_center = 0.5 * CONSTRAINT.center(obs), 0.7 * CONSTRAINT.center(next_obs)
     return Batch(obs, action, reward, terminated, next_obs, center, next_center)
 
@@ -70,7 +70,7 @@ MAPS = {"Alpha": "alpha_map", "Rad": "radial_map", "Gauge": "gauge_map", "Flow":
 
 
 def map_of(agent):
-    """The constraint's method for the map of an agent's name, "project" for most."""
+    """The name of the constraint's method for the agent's map; "project" for most agents."""
     return MAPS.get(agent.config.algo[1:], "project")
 
 
@@ -79,7 +79,7 @@ def squashes(agent):
 
 
 def projects(agent):
-    """Whether the map pulls random actions back by projection, and thus needs no centre."""
+    """Whether the map pulls random actions back by projection, which needs no centre."""
     return map_of(agent) in ("project", "flow")
 
 
@@ -91,7 +91,7 @@ def mapped(agent, obs, suggested, center=None):
 
 
 def mlp(net, row, x):
-    """The network of one row, layer by layer."""
+    """The output of one row's network, layer by layer."""
     for number, layer in enumerate(net.layers):
         x = (x.relu() if number else x) @ layer.weight[row] + layer.bias[row]
     return x
@@ -104,7 +104,7 @@ def q_values(critic, i, obs, action):
 
 
 def decoded(agent, obs, suggested):
-    """What the flow makes of a suggestion, coupling by coupling, and the logarithm of its Jacobian's determinant."""
+    """The flow's image of a suggestion, coupling by coupling, and its log-determinant."""
     state = agent.map.state()
     features = 2.0 * obs[..., :DIM] + 3.0
     features = ((features - state["feature_mean"]) / state["feature_scale"]).clamp(-5, 5)
@@ -122,7 +122,7 @@ def decoded(agent, obs, suggested):
 
 
 def deterministic(agent, actor, i, obs, center):
-    """A TD3 actor's suggestion and what its map makes of it."""
+    """A TD3 actor's suggestion and the mapped action."""
     raw = mlp(actor, i, obs)
     suggested = raw.tanh() if squashes(agent) else raw
     return suggested, mapped(agent, obs, suggested, center)
@@ -165,7 +165,7 @@ def sampled(agent, actor, i, obs, center, noise):
 
 
 def expected_actor_loss(name, agent, actor, temperature, batch, noise):
-    """The loss of the table in the paper's Section "Algorithms", for each seed the mean over its batch."""
+    """The loss in the table of the paper's Section "Algorithms": for each seed the mean over its batch."""
     losses = []
     for i in range(len(SEEDS)):
         obs, center = batch.obs[i], batch.center[i]
@@ -212,7 +212,7 @@ def expected_targets(name, agent, before, temperature, batch, noise):
 
 
 def draw_noise(agent, stream):
-    """Noise at s and at s' of one update, from a copy of the agent's own stream."""
+    """The noise at s and at s' of one update, from a copy of the agent's own stream."""
     if not agent.config.gsde:
         both = stream.normal(2, BATCH, DIM)
         return both[:, 0], both[:, 1]
@@ -225,7 +225,7 @@ def gradients(module):
 
 
 def assert_gradients(module, loss, at):
-    """The gradients left in `module` are those of `loss` with respect to the parameters of `at`, its copy."""
+    """Assert that the gradients in `module` are those of `loss` with respect to the parameters of its copy `at`."""
     expected = torch.autograd.grad(loss, list(at.parameters()))
     assert sum(float(g.abs().sum()) for g in expected) > 1e-3
     for (name, found), wanted in zip(gradients(module).items(), expected, strict=True):
@@ -235,7 +235,7 @@ def assert_gradients(module, loss, at):
 
 
 def second_step(name, gsde=False):
-    """The agent after its second update, its networks before that, the batch and the noise it was given."""
+    """The agent after its second update, its networks before that update, and the update's batch and noise."""
     agent = make_agent(name, gsde)
     stream = Streams(SEEDS, "update")
     sac = name in SAC_NAMES
@@ -280,7 +280,7 @@ def test_the_temperatures_gradient(name, gsde):
 
 
 def test_the_batch_leaves_no_case_out():
-    """Suggestions outside the set, noise beyond its clip, actions beyond the box, either critic the smaller one."""
+    """Suggestions outside the set, clipped noise, actions outside the box, and either critic as the smaller one."""
     batch = make_batch(seed=2)
     assert (CONSTRAINT.center(batch.obs).abs() > 0.05).any()
     for name in TD3_NAMES:
@@ -430,7 +430,7 @@ def test_the_variance_of_gsde_is_that_of_its_noise():
     torch.testing.assert_close((samples - mean).mean(0) / std[0], torch.zeros(4, DIM), rtol=0, atol=0.03)
     variance = (latent[:, :, None] ** 2 * actor.log_std[0].exp() ** 2).sum(1)
     torch.testing.assert_close(std[0] ** 2, variance + 1e-6)
-    # Within one draw of theta the noise of two states is not independent: they share theta.
+    # With one draw of theta, the noise of two states is correlated, because they share theta.
     noise = (samples - mean)[:, :2, 0] / std[0, :2, 0]
     correlation = (latent[0] * latent[1] * actor.log_std[0, :, 0].exp() ** 2).sum() / (std[0, 0, 0] * std[0, 1, 0])
     torch.testing.assert_close(noise.prod(1).mean(), correlation.detach(), rtol=0, atol=0.03)
@@ -496,7 +496,7 @@ def test_the_policy_of_evaluation_is_the_mapped_mean(name, gsde):
     torch.testing.assert_close(agent.policy([0, 1])(obs), torch.stack(wanted))
     for _ in range(2):
         torch.testing.assert_close(act(obs[1:]), wanted[1].unsqueeze(0))
-    # It is a copy, and it draws nothing.
+    # The policy is a copy, and it draws no random numbers.
     for parameter in agent.actor.parameters():
         parameter.data.add_(1.0)
     torch.testing.assert_close(act(obs[1:]), wanted[1].unsqueeze(0))
@@ -547,11 +547,11 @@ def test_acting_maps_explored_suggestions_and_pulls_random_ones_back(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_executed_and_warm_up_actions_are_feasible(name):
-    """The algorithm's own map makes the executed action; warm-up takes one that leaves feasible actions alone."""
+    """The algorithm's map makes the executed action; in warm-up, a map that does not change feasible actions."""
     agent, obs = make_agent(name), make_batch().obs
     suggested = 3 * torch.randn(obs.shape[:-1] + (DIM,), generator=torch.Generator().manual_seed(1))
     suggested = suggested.tanh() if squashes(agent) else suggested
-    rounding = 1e-5 if map_of(agent) == "flow" else 0.0  # of `decoded`, which takes other steps
+    rounding = 1e-5 if map_of(agent) == "flow" else 0.0  # `decoded` computes in another order
     torch.testing.assert_close(
         agent.feasible(obs, suggested, None), mapped(agent, obs, suggested), rtol=rounding, atol=rounding
     )

@@ -55,11 +55,11 @@ def test_the_first_feasible_draw_is_executed_and_those_before_are_kept(warming_u
                 if BALL.violation(obs[i], draw) <= 0:
                     break
                 kept[i].append(torch.cat([obs[i], draw]))
-            # Where all are infeasible, the last one is stored and its projection executed.
+            # If all draws are infeasible, the last one is stored and its projection executed.
             assert torch.equal(found.stored[i], draw)
             torch.testing.assert_close(found.executed[i], BALL.project(obs[i], draw))
     for i, rows in enumerate(kept):
-        assert len(rows) > 20 and agent.rejected[i] == len(rows)  # the ring has gone round
+        assert len(rows) > 20 and agent.rejected[i] == len(rows)  # the ring buffer has wrapped
         for number in range(len(rows) - 20, len(rows)):
             assert torch.equal(agent.rejections[i, number % 20], rows[number])
 
@@ -82,7 +82,7 @@ def test_after_the_last_rejection_the_draw_is_projected_and_stored_as_it_is():
 
 
 def test_each_step_counts_alike_in_the_acceptance_rate():
-    """Every second step, one draw of a hundred is feasible on average; at the others all are."""
+    """At every second step, one draw in a hundred is feasible on average; at the other steps all draws are."""
     constraint = LinearConstraint(
         DIM, lambda obs: torch.eye(DIM).expand(*obs.shape[:-1], DIM, DIM), lambda obs: 2.0 * obs[..., :DIM] - 0.8
     )
@@ -146,7 +146,7 @@ def critic_value(net, row, obs, action, preference):
 
 def test_a_gradient_step_follows_the_formulas():
     agent, batch = make_agent(), make_batch()
-    agent.missing[:, 1:3] = 0.0  # two of the four earlier critics are there
+    agent.missing[:, 1:3] = 0.0  # two of the four earlier critics exist
     streams = Streams(SEEDS, "update")
     streams.uniform(2)
     noise, drawn = streams.normal(2, BATCH, DIM), preferences(streams.uniform(4, 1))
@@ -180,7 +180,7 @@ def test_a_gradient_step_follows_the_formulas():
             actor_losses[i] += (alpha[i] * log_prob.detach() - max(values)) / BATCH
     before = [p.detach().clone() for p in agent.critic.parameters()]
 
-    # The actor's loss comes after the critic's step. Without a learning rate, the critic stays what it was.
+    # The actor's loss is computed after the critic's step. A learning rate of zero leaves the critic unchanged.
     agent.critic_optimizer.param_groups[0]["lr"] = 0.0
     agent.update(batch)
     torch.testing.assert_close(agent.losses["critic"], critic_losses)
@@ -190,11 +190,11 @@ def test_a_gradient_step_follows_the_formulas():
 
 def test_rejected_actions_stand_in_the_last_places_of_a_batch():
     agent, batch = make_agent(rejected_share=0.4, rejected_share_decay=0.5, rejected_share_every=500), make_batch()
-    assert torch.equal(agent.with_rejections(batch).obs, batch.obs)  # there are none yet
+    assert torch.equal(agent.with_rejections(batch).obs, batch.obs)  # no rejections yet
     obs = torch.tensor([5.0, 6.0]).unsqueeze(-1).expand(2, OBS)
     agent.remember([0, 1], obs, torch.full((2, 100, DIM), 0.9), torch.tensor([3, 6]), torch.zeros(2))
     assert agent.rejected[:, 0].tolist() == [3, 6]
-    for steps, places in (0, (3, 4)), (499, (3, 4)), (500, (2, 2)), (1_000, (1, 1)):  # three are no four
+    for steps, places in (0, (3, 4)), (499, (3, 4)), (500, (2, 2)), (1_000, (1, 1)):  # there are only three, not four
         agent.steps.fill_(steps)
         mixed = agent.with_rejections(batch)
         for i, count in enumerate(places):
@@ -269,7 +269,7 @@ def test_copies_of_the_critic_take_turns():
 
 
 def test_a_step_without_the_losing_choices_has_the_gradient_of_one_with_all():
-    """The best critic and preference of each state are found without gradients."""
+    """The best critic and preference of each state are chosen without gradients."""
     agent, batch = make_agent(), make_batch()
     agent.missing[:, 2:] = 0.0
     drawn = preferences(torch.rand(2, 4, 1) * 2 - 1)
@@ -284,7 +284,7 @@ def test_a_step_without_the_losing_choices_has_the_gradient_of_one_with_all():
     one, other = (torch.autograd.grad(v.sum(), action, retain_graph=True)[0] for v in (value, expected))
     torch.testing.assert_close(one, other)
     choices = torch.stack(everything).argmax(0)
-    assert len(choices.unique()) > 2  # states differ in what is best
+    assert len(choices.unique()) > 2  # the best choice differs between states
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """Wrong command lines, results folders and constraints: one line that says what is wrong, exit code 2, no traceback.
 
-Wrong settings of `key=value` are in tests/test_cli.py as well.
+tests/test_cli.py also tests wrong `key=value` settings.
 """
 
 import json
@@ -28,7 +28,7 @@ VARIANT = "DPre,batch_size=4,eval_episodes=1,eval_every=20,final_episodes=1,hidd
 
 
 def refused(capsys, words):
-    """The only line that the command `words` says."""
+    """The only line that the refused command `words` prints."""
     capsys.readouterr()
     assert run_command(words.split()) == 2
     captured = capsys.readouterr()
@@ -211,7 +211,7 @@ def test_constraints_that_cannot_be_made(make, said):
 
 
 def test_a_constraint_that_breaks_down_later_says_where(capsys, tmp_path, monkeypatch):
-    def bound(obs):  # the set is empty once the arm moves, and it rests at the start
+    def bound(obs):  # empty once the arm moves; at the start, the arm rests
         return torch.where(obs[..., 6:7].abs() > 0.05, -5.0, 1.0)
 
     monkeypatch.setitem(TASKS, "R+X", Task(Reacher, rows(lambda o: ones(o, 1, 2), bound), "a task", "a formula", 20))

@@ -1,4 +1,4 @@
-"""Work goes on after a definition has changed: `overwrite=changed`, and messages that name the way."""
+"""Continuing after a definition has changed: `overwrite=changed`, and the messages that recommend it."""
 
 import fcntl
 import json
@@ -32,7 +32,7 @@ TWO_CELLS = CHECKPOINTED.replace("algo=DPre env=R+N", "algo=DPre,DRad env=R+X,R+
 
 @pytest.fixture
 def set_bound():
-    """Gives the task R+X a bound."""
+    """A function that sets the bound of the task R+X."""
 
     def give(bound):
         TASKS.pop("R+X", None)
@@ -68,7 +68,7 @@ def test_an_interrupted_sweep_that_starts_changed_cells_again_resumes(tmp_path, 
         train_cells(cells_of(again), Breaks(15))
     assert len(old_folders(tmp_path)) == 2  # the seeds of the first cell
     assert sorted(map(bound_of, runs_of(tmp_path))) == ["0.05", "0.05", "0.9", "0.9"]
-    assert run_command([*words.split(), "jobs=1"]) == 2  # the other cell is still of another definition
+    assert run_command([*words.split(), "jobs=1"]) == 2  # the other cell still has the old definition
     capsys.readouterr()
 
     train_cells(cells_of(again))
@@ -76,7 +76,7 @@ def test_an_interrupted_sweep_that_starts_changed_cells_again_resumes(tmp_path, 
     assert len(old_folders(tmp_path)) == 4 and set(map(bound_of, old_folders(tmp_path))) == {"0.05"}
     assert set(map(bound_of, runs_of(tmp_path))) == {"0.9"} and all(map(has_ended, runs_of(tmp_path)))
     assert {folder: (folder / "result.json").stat().st_mtime_ns for folder in others} == others
-    train_cells(cells_of(again))  # now there is nothing to do
+    train_cells(cells_of(again))  # nothing is left to do
     assert len(old_folders(tmp_path)) == 4
     assert run_command(words.split()) == 0
 
@@ -181,7 +181,7 @@ def test_the_last_line_on_a_terminal_starts_at_its_left(tmp_path):
     try:
         while part := os.read(terminal, 4096):
             said += part
-    except OSError:  # the other side is closed
+    except OSError:  # the other end is closed
         pass
     assert process.wait(timeout=120) == 0
     os.close(terminal)

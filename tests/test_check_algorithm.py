@@ -1,4 +1,4 @@
-"""`algos.check_algorithm`: every name passes, and each broken contract is named with its remedy."""
+"""`algos.check_algorithm`: every algorithm passes, and a message names each broken contract and its remedy."""
 
 import time
 
@@ -28,7 +28,7 @@ def test_an_unknown_name():
 
 
 class OrnsteinUhlenbeck(TD3):
-    """TD3 whose noise is correlated within an episode: it needs the start of an episode and memory."""
+    """TD3 with noise that is correlated within an episode: it needs a memory that is reset when an episode starts."""
 
     def build(self, init):
         super().build(init)
@@ -45,7 +45,7 @@ class OrnsteinUhlenbeck(TD3):
     @torch.no_grad()
     def explore(self, obs, which):
         fresh = self.exploration.normal(self.action_dim, which=which)
-        for i in which:  # the other rows stay as they are
+        for i in which:  # the other rows do not change
             self.noise[i] = 0.85 * self.noise[i] + 0.3 * fresh[i]
         return self.suggest(self.actor, obs.unsqueeze(1)).squeeze(1) + self.noise
 

@@ -1,5 +1,5 @@
-"""`envs.check_robot` names each mistake of a robot, passes all robots of the project, and runs before a training;
-robots made from Gymnasium environments."""
+"""`envs.check_robot`: it names each mistake in a robot, passes all robots of the project, and runs before a training.
+Also robots made from Gymnasium environments."""
 
 import os
 import subprocess
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 class Good(envs.Robot):
-    """A mass on a line, which each mistake below changes in one way."""
+    """A mass on a line. Each class with a mistake below changes it in one way."""
 
     obs_dim, action_dim, max_episode_steps, fps = 2, 1, 60, 10
 
@@ -64,7 +64,7 @@ def test_robots_that_keep_the_protocol(robot, steps):
 
 
 def with_step(change):
-    """`Good`, whose step returns what `change` makes of its answer."""
+    """`Good` with a step that returns `change` of its normal answer."""
     return type("Bad", (Good,), {"step": lambda self, action: change(*Good.step(self, action))})
 
 
@@ -136,7 +136,7 @@ class Remembers(Stateless):
 
 
 class DrawsMoreAtFirst(Stateless):
-    """Its observations do not show that the first reset draws more random numbers than the later ones."""
+    """Draws more random numbers at the first reset than at later ones, which its observations do not show."""
 
     def reset(self, rng):
         obs = super().reset(rng)
@@ -188,7 +188,7 @@ class SharedState(Good):
 
 
 class KeepsState(Good):
-    """Reads the array that set_state got at the next step."""
+    """Keeps the array given to set_state, and reads it at the next step."""
 
     given = None
 
@@ -414,7 +414,7 @@ def test_environments_that_make_no_robot(name, said):
 
 
 class Strange(gymnasium.Env):
-    """Ends its episodes itself, and has no pictures."""
+    """Ends its own episodes, and has no pictures."""
 
     observation_space = gymnasium.spaces.Box(-1, 1, (2, 2))
 
@@ -452,7 +452,7 @@ def test_limits_and_boxes_that_do_not_fit(strange):
         envs.GymnasiumRobot(strange(max_episode_steps=10, kwargs={"bound": np.inf}))
     robot = envs.GymnasiumRobot(strange(max_episode_steps=3))()
     assert robot.reset(np.random.default_rng(0)).shape == (4,)
-    assert [robot.step(np.zeros(2))[2] for _ in range(3)] == [False] * 3  # the environment around it truncates
+    assert [robot.step(np.zeros(2))[2] for _ in range(3)] == [False] * 3  # the outer environment truncates
     with pytest.raises(RuntimeError, match="makes no pictures"):
         robot.render()
     robot = envs.GymnasiumRobot(strange(max_episode_steps=10))()

@@ -1,4 +1,4 @@
-"""What a run will ask of constraint, map and algorithm is asked before it starts, and the message names it."""
+"""The check before a run calls constraint, map and algorithm as the run will, and its message names what fails."""
 
 import pytest
 import torch
@@ -34,7 +34,7 @@ class BreaksGauge(Ball):
 
 
 class OneAxis(LinearConstraint):
-    """Does not work with two leading axes."""
+    """Fails for observations with two leading axes."""
 
     def A(self, obs):
         return torch.ones(len(obs), 1, 2)
@@ -79,7 +79,7 @@ class CannotBeSaved(TD3):
 
 
 class RobotCannotBeSaved(Reacher):
-    simulators = {}  # those of Reacher are other classes
+    simulators = {}  # Reacher's simulators are other classes
 
     def get_state(self):
         return [1.0]
@@ -167,7 +167,7 @@ def test_an_error_in_an_algorithms_own_code_keeps_its_traceback(tmp_path, monkey
 
 
 def test_the_check_leaves_no_trace(tmp_path, monkeypatch):
-    """Neither in the task's constraint nor in PyTorch's random numbers."""
+    """It changes neither the task's constraint nor the state of PyTorch's random numbers."""
     constraint = TASKS["R+L2"].constraint
     before = dict(vars(constraint)), torch.get_rng_state()
     assert run_command(["algo=SRad", *WORDS.replace("R+X", "R+L2").split(), f"results={tmp_path}"]) == 0

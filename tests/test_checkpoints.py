@@ -1,4 +1,4 @@
-"""Checkpoints: damage, the choice among them, what they keep, and resumptions from them."""
+"""Checkpoints: damage, the choice of one to resume from, their contents, and resuming."""
 
 import hashlib
 import io
@@ -110,9 +110,9 @@ A, B = (1, 2, 3), (4, 5)
 @pytest.mark.parametrize(
     "intact, moments, fresh",
     [
-        # all whole: the newest
+        # all are whole: the newest is chosen
         ({s: [kept(8, "n", A), kept(7, "m", A)] for s in A}, [dict.fromkeys(A, "n")], []),
-        # death between the writing of two seeds' checkpoints
+        # killed between writing the checkpoints of two seeds
         (
             {1: [kept(8, "n", A), kept(7, "m", A)], 2: [kept(7, "m", A), kept(6, "l", A)], 3: [kept(7, "m", A)]},
             [dict.fromkeys(A, "m")],
@@ -125,9 +125,9 @@ A, B = (1, 2, 3), (4, 5)
             [dict.fromkeys(A, "m")],
             [],
         ),
-        # one seed has lost all of its checkpoints: the others lose nothing
+        # one seed has lost all its checkpoints: the others lose nothing
         ({1: [], 2: [kept(8, "n", A), kept(7, "m", A)], 3: [kept(8, "n", A)]}, [{2: "n", 3: "n"}], [1]),
-        # two groups, and a seed that is new
+        # two groups and a new seed
         (
             {s: [kept(1, "n", A)] for s in A} | {s: [kept(9, "z", B)] for s in B} | {6: []},
             [dict.fromkeys(A, "n"), dict.fromkeys(B, "z")],
@@ -155,7 +155,7 @@ def test_replay_files_hold_each_transition_once_and_go_when_it_is_overwritten(tm
         ["replay-0-20.f32", "replay-20-40.f32"],
         ["replay-0-20.f32", "replay-20-40.f32", "replay-40-60.f32"],
     ]
-    # 71 to 120 are in the buffer; the checkpoint before, of 100, needs 51 to 100.
+    # The buffer has transitions 71 to 120. The previous checkpoint, at 100, needs 51 to 100.
     assert kept_files[-1] == [f"replay-{start}-{start + 20}.f32" for start in (100, 40, 60, 80)]
     newest_one, before = folder.read()[0]
     for checkpoint, stop in ((newest_one, 120), (before, 100)):
@@ -256,7 +256,7 @@ def test_tables_go_back_to_what_a_checkpoint_holds(tmp_path):
     assert writer.tables()["training.csv"] == tables["training.csv"] + "20,0.2,nan\n"
     assert writer.last_finite_evaluation() == {"step": 10, "return_mean": 2.0}
 
-    (tmp_path / "seed=1" / "info.json").write_text("{")  # informs people, and nothing rests on it
+    (tmp_path / "seed=1" / "info.json").write_text("{")  # for people: resuming does not need it
     again = RunWriter.resume(tmp_path / "seed=1", {"tau": 0.5}, {"commit": "b"}, eval_episodes=2)
     again.restore_tables(tables)
     assert again.tables() == tables and results.read_run(again.folder).config == {"tau": 0.5}

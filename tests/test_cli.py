@@ -113,13 +113,13 @@ def configs(words):
 def test_lists_and_all_make_the_product():
     cells = cells_of(["algo=DRad,DPre", "env=all"])
     assert len(cells) == 2 * len(TASKS)
-    # A key of some algorithms only goes to those.
+    # A key that only some algorithms have is applied to those only.
     by_name = {config.algo: config for config in configs(["algo=all", "env=R+N", "fw_learning_rate=0.5"])}
     assert by_name["NFW"].fw_learning_rate == 0.5 and not hasattr(by_name["DPre"], "fw_learning_rate")
 
 
 def test_the_papers_hyperparameters():
-    """Spot checks of Table "Hyperparameters used in the experiments", through the resolution of cells."""
+    """Spot checks of the paper's Table "Hyperparameters used in the experiments", in the cells of commands."""
     cells = {(c.algo, c.env): c for c in configs(["algo=all", "env=all"])}
     assert len(cells) == len(TASKS) * len(ALGORITHMS)
     assert [config.algo for config in configs(["algo=paper", "env=R+N"])] == list(PAPER) and len(PAPER) == 13
@@ -179,7 +179,7 @@ def test_interrupted_by_signals_it_resumes_and_a_second_process_keeps_off(tmp_pa
             stderr=subprocess.PIPE,
             text=True,
             env=os.environ | {"PYTHONUNBUFFERED": "1"},
-            # Whoever runs the tests in the background may have them ignore the signal, and children inherit that.
+            # A shell that runs the tests in the background may ignore the signal, and child processes inherit that.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
 

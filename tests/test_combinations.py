@@ -1,4 +1,4 @@
-"""A comma list of values in a command: a cell for each of them, in all combinations."""
+"""Comma-separated values in a command: a cell for each combination of values."""
 
 import pickle
 
@@ -91,7 +91,7 @@ def test_all_combinations_in_the_order_of_the_words():
 
 def test_each_cell_comes_once():
     assert variants("algo=DRad env=R+L2 learning_rate=1e-3,0.001") == [("R+L2", "DRad")]
-    # A setting that only SRad has makes one cell of DRad.
+    # DRad lacks this setting, so it has one cell only.
     assert variants("algo=DRad,SRad env=R+L2 gsde=true,false") == [
         ("R+L2", "DRad"),
         ("R+L2", "SRad"),
@@ -100,7 +100,7 @@ def test_each_cell_comes_once():
 
 
 def test_a_cell_of_a_combination_is_started_by_its_own_words():
-    """As in a queue of processes (jobs=) and, pickled, as a Slurm job."""
+    """As a process of a queue (jobs=) and, pickled, as a Slurm job."""
     for cell in cells_of(
         "algo=SRad env=R+L2 seed=0-2 hidden=[8],[16,16] tau=0.1,0.2 train_freq=1,episode log=csv,wandb"
     ):
@@ -111,7 +111,7 @@ def test_a_cell_of_a_combination_is_started_by_its_own_words():
 
 
 def test_no_key_of_the_run_itself_makes_another_cell():
-    """Their values are in no name, so that several would train the same run."""
+    """Folder names do not contain these keys, so several values would train the same run."""
     words = {"seed": "1,2", "results": "a,b", "log": "csv,wandb"}
     assert words.keys() <= set(RUN_KEYS)
     (cell,) = cells_of(["algo=DRad", "env=R+L2", *(f"{key}={text}" for key, text in words.items())])

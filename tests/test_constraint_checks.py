@@ -1,4 +1,4 @@
-"""Wrong coefficients, centres and arguments of the closed forms: one line that says what is wrong, and no garbage."""
+"""Wrong coefficients, centres and arguments of the closed forms: an error of one line, never a wrong result."""
 
 import copy
 import math
@@ -98,7 +98,7 @@ def test_bounds_that_are_no_positive_numbers(bound):
 
 
 def test_a_bound_may_not_be_a_tensor():
-    """It would lose its gradient, and it does not say which observation it belongs to."""
+    """A tensor would lose its gradient, and it does not say to which observations its entries belong."""
     with pytest.raises(TypeError, match="bound must be a number or a function of the observation, got Tensor"):
         Ball(torch.tensor(0.5, requires_grad=True), 2)
     with pytest.raises(TypeError, match="weight must be a function of the observation, got list"):
@@ -177,7 +177,7 @@ def test_compiled_methods_are_those_of_eager_mode():
 
 
 def test_checks_ask_nothing_of_a_device():
-    """The first calls too may be on a GPU; the meta device has no values to answer with."""
+    """Not even in the first calls, which may be on a GPU. The meta device has no values, so a query would fail."""
     for name in SETS:
         constraint = copy.deepcopy(SETS[name])
         obs, action = torch.ones(2, 3, device="meta"), torch.ones(2, 2, device="meta")
@@ -259,7 +259,7 @@ def test_arrays_are_refused_by_the_other_methods_too():
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64])
 def test_half_precision_is_refused(dtype):
-    """It would round feasible points out of their set."""
+    """Its rounding would move feasible points out of the set."""
     constraint, obs, action = Ball(0.05, 2), torch.zeros(3), torch.ones(2, dtype=dtype)
     for method in (*METHODS, "contains"):
         with pytest.raises(TypeError, match=f"expected float32 or float64 actions, got {dtype}"):
@@ -296,7 +296,7 @@ NOT_EACH_ALONE = {
 
 @pytest.mark.parametrize("name", NOT_EACH_ALONE)
 def test_functions_of_a_batch_are_refused(name):
-    """A function that is right for one observation, or that normalises, gives each sample the set of the others."""
+    """A function that handles only one observation, or that normalises over the batch, mixes up the samples' sets."""
     obs, action = torch.arange(12.0).view(4, 3), torch.ones(4, 2)
     with pytest.raises(ConstraintError, match=r"\(obs\) of an observation depends on the others in its batch"):
         NOT_EACH_ALONE[name].project(obs, action)
@@ -323,8 +323,8 @@ def test_contains():
 
 @pytest.mark.parametrize("mode", [torch.inference_mode, torch.no_grad])
 def test_the_first_caller_s_mode_is_forgotten(mode):
-    """Tensors that are made in inference mode and kept would break the backward passes of all later callers."""
-    dim = 9  # of no other test: patterns are kept for the process
+    """Tensors created in inference mode and then cached would break the backward passes of all later callers."""
+    dim = 9  # used by no other test, because patterns are cached for the process
     for constraint in (WeightedL1(ones(dim), 1.0, dim), WeightedPositivePart(ones(dim), 1.0, dim)):
         for kept in (cached_patterns, quadrature):
             kept.cache_clear()

@@ -1,4 +1,4 @@
-"""Sets with 2^d rows: every method in many coordinates, and the rows themselves in few."""
+"""Sets with 2^d rows: every method in many dimensions, and all rows in few dimensions."""
 
 import itertools
 import time
@@ -32,7 +32,7 @@ every_set = pytest.mark.parametrize("name", sets(2))
 
 
 def excess(weight: np.ndarray, action: np.ndarray, entries: tuple[float, float]) -> np.ndarray:
-    """Excess of the action over each row, by Python's own loop over the patterns; the empty subset is no row."""
+    """Excess of the action over each row, by a Python loop over the patterns. The empty subset is not a row."""
     values = []
     for pattern in itertools.product(entries, repeat=len(weight)):
         if any(pattern):
@@ -101,10 +101,10 @@ def test_every_method_in_many_coordinates(name, dim):
         assert value.isfinite().all() and gradients.isfinite().all()
     assert (constraint.violation(weight, center) < 0.0).all()
     assert constraint.violation(weight, action).max() > 0.0 > constraint.violation(weight, action).min()
-    # The oracle's value is the largest of all points at hand.
+    # The oracle's value is at least that of every other point here.
     for point in (center, *mapped.values()):
         assert ((best - point) * gradient).sum(-1).min() >= -1e-9
-    assert time.perf_counter() - start < 30.0  # 2^30 rows would take longer, or more memory than there is
+    assert time.perf_counter() - start < 30.0  # explicit 2^30 rows would need more time or memory
 
 
 @every_set

@@ -1,7 +1,6 @@
-"""The closed forms in any dimension and on awkward input, certified by their optimality conditions.
+"""The closed forms in any dimension and on awkward input, verified by their optimality conditions.
 
-Coefficients and points are what Hypothesis comes up with: zeros, ties, 1e-6 beside 1e6, points on faces and corners,
-points 1e6 away.
+Hypothesis chooses coefficients and points: zeros, ties, 1e-6 beside 1e6, points on faces and corners, points 1e6 away.
 """
 
 from functools import partial
@@ -28,7 +27,7 @@ from constraints import (
 numbers = st.one_of(
     st.sampled_from([0.0, 1.0, -1.0, 0.5, 1e-6, 1e3, -1e6]), st.floats(-10.0, 10.0, allow_subnormal=False)
 )
-NEAR = 1e-7  # rows of 1e6 beside a bound of 0.05 hold a point to some 1e-9
+NEAR = 1e-7  # rows of 1e6 with a bound of 0.05 fix a point to about 1e-9
 bounds = st.sampled_from([0.05, 0.3, 1.0, 1.7, 10.0])
 
 
@@ -41,7 +40,7 @@ def second(obs):
 
 
 def planar_matrix(obs):
-    """vv' + s e1 e1': singular where s = 0."""
+    """v v' + s e1 e1', which is singular if s = 0."""
     v = first(obs)
     return v.unsqueeze(-1) * v.unsqueeze(-2) + torch.diag_embed(second(obs) * v.new_tensor([1.0, 0.0]))
 
@@ -99,7 +98,7 @@ def problems(draw, largest, smallest=1):
 def case(name, data):
     largest, build, refer = FAMILIES[name]
     w, s, x, b = data.draw(problems(largest, 2 if name == "planar ellipse" else 1))
-    if name == "planar ellipse":  # its matrix has squares: beyond this, rounding of the point turns its normal
+    if name == "planar ellipse":  # its matrix has squares: rounding of larger points would turn the normal
         w, s = w.clip(-100.0, 100.0), s.clip(-100.0, 100.0)
     obs = torch.from_numpy(np.concatenate((w, s)))
     return build(len(w), b), refer(w, s, b), obs, torch.from_numpy(x)
@@ -112,9 +111,9 @@ def test_projection(name, data):
     point = constraint.project(obs, x)
     assert written.violation(point.numpy()) <= 1e-9
     residual = written.normal_cone_residual(point.numpy(), (x - point).numpy(), NEAR)
-    # The normal of a planar ellipse turns with the point, up to 1e6 times as fast.
+    # The normal of a planar ellipse may turn 1e6 times as fast as the point moves.
     assert residual <= (1e-6 if name == "planar ellipse" else 1e-8) * max(1.0, x.abs().max().item())
-    # The same through batches, and with leading axes
+    # The same in batches with leading axes.
     again = constraint.project(obs.expand(2, 3, -1), x.expand(2, 3, -1))
     torch.testing.assert_close(again, point.expand(2, 3, -1), rtol=0.0, atol=NEAR)
 
@@ -163,10 +162,10 @@ def test_a_center_without_weights_is_the_origin():
 
 @every_family
 def test_bounds_that_are_functions_of_the_observation(name):
-    """Each sample has the set of its own number, in every method and written out."""
+    """Each sample has its own bound, in every method and in the explicit form."""
     largest, build, _ = FAMILIES[name]
     if name == "box":
-        return  # it has no bound
+        return  # this set has no bound
     dim = min(largest, 4)
     generator = torch.Generator().manual_seed(0)
     obs, action = (torch.randn(3, n, generator=generator).double() for n in (2 * dim, dim))

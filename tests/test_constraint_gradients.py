@@ -75,7 +75,7 @@ OPTIONS = dict(eps=1e-6, atol=1e-5, rtol=1e-4)
 
 
 def case(name: str, count: int = 12, scale: float = 1.3) -> tuple[Constraint, Tensor, Tensor, Tensor]:
-    """The set, its parameters, observations and actions; all want gradients."""
+    """The set, its parameters, observations and actions. The tensors require gradients."""
     coefficients = Coefficients()
     constraint = sets(coefficients)[name]
     generator = torch.Generator().manual_seed(7)
@@ -85,7 +85,7 @@ def case(name: str, count: int = 12, scale: float = 1.3) -> tuple[Constraint, Te
 
 
 def assert_gradients(function, theta: Tensor, *others: Tensor) -> None:
-    """Gradients with respect to `others` and, through the module that holds it, `theta`."""
+    """Check the gradients with respect to `others` and, through the module that holds it, `theta`."""
 
     assert gradcheck(function, others, **OPTIONS)
     (exact,) = torch.autograd.grad(weighted(function(*others)), theta)
@@ -102,7 +102,7 @@ def assert_gradients(function, theta: Tensor, *others: Tensor) -> None:
 
 
 def weighted(value: Tensor) -> Tensor:
-    """A scalar to which every entry adds with a weight of its own."""
+    """A weighted sum of all entries, with a different weight for each."""
     return (value * torch.linspace(-1.0, 1.5, value.numel(), dtype=value.dtype).view_as(value)).sum()
 
 
@@ -154,7 +154,7 @@ def test_densities(name):
     assert_gradients(lambda o, a: constraint.gauge_log_prob(o, a, a.sum(-1)), theta, obs, inside)
 
 
-# ------------------------------------------------------------------------------------------ where there are none
+# ------------------------------------------------------------------------------------------ no gradients
 
 
 def general(learned: Tensor) -> dict[str, Constraint]:
@@ -183,7 +183,7 @@ def test_general_sets_have_those_of_violation_penalty_and_gauge(name):
 
 def test_the_oracle_refuses_what_it_would_cut():
     constraint, theta, obs, action = case("l1")
-    for wanted in (obs, obs.detach()):  # in the second the weights are learned
+    for wanted in (obs, obs.detach()):  # in the second case only the weights are learned
         with pytest.raises(RuntimeError, match="linear_oracle has no derivatives"):
             constraint.linear_oracle(wanted, action.detach())
     with torch.no_grad():
@@ -214,7 +214,7 @@ def test_a_constraint_of_ones_own_refuses_what_it_would_cut():
 
 @every_set
 def test_gradients_are_finite_where_coefficients_are_zero(name):
-    """A robot starts with velocities of 0."""
+    """Coefficients are zero at a robot's start, when all velocities are 0."""
     constraint, theta, obs, action = case(name)
     with torch.no_grad():
         obs[:3] = 0.0
@@ -252,7 +252,7 @@ def test_values_do_not_depend_on_who_wants_gradients(name):
 
 
 def with_fixed_sets(name: str) -> tuple[Constraint, Tensor, Tensor]:
-    """The set without learned parameters, observations and actions; also sets that need no observation."""
+    """A set without learned parameters, observations and actions. Includes sets that need no observation."""
     if name in FIXED:
         obs = torch.zeros(5, 2 * DIM, dtype=torch.float64)
         return FIXED[name], obs, 1.3 * torch.randn(5, DIM, generator=torch.Generator().manual_seed(3)).double()
@@ -342,7 +342,7 @@ def test_vmap_of_what_looks_at_values_says_so(name):
 
 @every_set
 def test_second_derivatives_are_refused_or_right(name):
-    """The usual case, gradients with respect to the action alone, has none; nor have projections."""
+    """Gradients with respect to the action alone, the usual case, have no second derivatives; nor have projections."""
     constraint, theta, obs, action = case(name, count=4)
     theta.requires_grad_(False)
     plain = obs.detach()

@@ -79,7 +79,7 @@ def test_center_is_chebyshev_s_or_the_origin(task):
         assert task.constraint.origin_centered
         return
     for k in range(len(obs)):
-        # A centre of radius r keeps the violation, which has unit rows, below -r. Zero rows have no distance.
+        # The centre of a ball of radius r has a violation of -r or less in unit rows. Zero rows have no distance.
         reference = task.reference_at(obs[k])
         kept = np.linalg.norm(reference.rows, axis=1) > 0.0
         reference = ReferenceSet(reference.rows[kept], reference.bounds[kept])
@@ -89,9 +89,9 @@ def test_center_is_chebyshev_s_or_the_origin(task):
 @pytest.mark.parametrize(
     "w, s, gradient",
     [
-        ([2.0, 1.0], [1.0, 1.0], [0.2, 0.1]),  # the ellipse holds the oracle, the row does not
-        ([1.5, 3.0], [0.0, 3.0], [0.15, 0.3]),  # the ellipse has no word on the first coordinate
-        ([1.3125, 3.0], [1.0, 1.0], [0.13125, 0.3]),  # the ratios tie but for a rounding
+        ([2.0, 1.0], [1.0, 1.0], [0.2, 0.1]),  # the ellipse limits the oracle, the row does not
+        ([1.5, 3.0], [0.0, 3.0], [0.15, 0.3]),  # the ellipse does not limit the first coordinate
+        ([1.3125, 3.0], [1.0, 1.0], [0.13125, 0.3]),  # the ratios are equal up to rounding
         ([1.0, 1.0], [0.0, 1.0], [0.1, 0.1]),
     ],
 )
@@ -137,7 +137,7 @@ def test_large_directions_stay_finite_in_float32(task):
 @pytest.mark.parametrize("name", ["R+M", "H+M", "W+M", "HC+MA"])
 @pytest.mark.parametrize("speed", [1e12, 1e15, 1e18, 1e30])
 def test_rays_off_centre_are_exact_at_any_velocity(name, speed):
-    """Where a coordinate crosses 0 its rounding, times such a velocity, would exceed any bound."""
+    """A coordinate that crosses 0 has a rounding error that, times such a velocity, would exceed any bound."""
     task = TASKS[name]
     obs, action = sample_obs(task, 500, 19, largest=1.0), sample_action(task, 500, 19, 3.0)
     velocities(obs).mul_(speed)
@@ -192,7 +192,7 @@ def test_radial_log_prob_is_the_jacobian_s_determinant(task):
     got = task.constraint.radial_log_prob(obs, action, log_prob)
     for k in range(len(obs)):
         jacobian = torch.autograd.functional.jacobian(lambda a, k=k: task.constraint.radial_map(obs[k], a), action[k])
-        # Past L = 6 or so the determinant itself loses digits; the formula does not.
+        # Beyond a gauge of about 6, the determinant loses digits; the formula does not.
         if jacobian.det().abs() > 1e-6:
             expected = log_prob[k] - jacobian.det().abs().log()
             torch.testing.assert_close(got[k], expected, rtol=1e-7, atol=1e-7)
@@ -209,13 +209,13 @@ def test_alpha_log_prob_has_mass_one(name):
     angle = (torch.arange(count, dtype=torch.float64) + 0.5) * (2.0 * math.pi / count)
     ray = torch.stack((angle.cos(), angle.sin()), -1)
     radius = 1.0 / constraint.gauge(obs, ray, center)
-    # Interior, in polar coordinates around the centre.
+    # Interior: integrate in polar coordinates around the centre.
     fraction = (torch.arange(200, dtype=torch.float64) + 0.5) / 200
     coarse, reach = ray[::20], radius[::20]
     inside = center + fraction[:, None, None] * reach[:, None] * coarse
     density = constraint.alpha_log_prob(obs, inside, mean, std).exp()
     interior = (density * fraction[:, None] * reach**2).mean(0).mean() * 2.0 * math.pi
-    # Boundary: each segment of the polygon through the boundary points carries the density at its ends.
+    # Boundary: on each segment of the polygon through the boundary points, use the density at the ends.
     boundary = center + radius[:, None] * ray
     beyond = center + 1.5 * radius[:, None] * ray  # any action on the ray past the boundary maps to it
     surface = constraint.alpha_log_prob(obs, beyond, mean, std).exp()
@@ -316,7 +316,7 @@ def test_every_point_is_feasible(task, seed, reach, dtype):
     ):
         assert point.dtype == dtype
         assert task.constraint.violation(obs.double(), point.double()).max() <= tolerance
-    # A projection leaves feasible points alone and brings no two points further apart.
+    # A projection leaves feasible points unchanged and does not increase distances.
     again = task.constraint.project(obs, projected)
     torch.testing.assert_close(again, projected, rtol=0.0, atol=tolerance)
     other = sample_action(task, 40, seed + 1, reach).to(dtype)
@@ -435,7 +435,7 @@ def test_wrong_arguments_are_refused():
         Box(0)
     with pytest.raises(ValueError, match="coordinates"):
         Box(2).project(torch.zeros(4), torch.zeros(3))
-    # Their results would be cut to whole numbers.
+    # Results would be truncated to whole numbers.
     for method in (Box(2).project, Box(2).alpha_map, Box(2).linear_oracle, Box(2).violation):
         with pytest.raises(TypeError, match="int64"):
             method(torch.zeros(4), torch.ones(2, dtype=torch.int64))
@@ -448,7 +448,7 @@ def test_nan_in_the_observation_is_passed_on(task):
     obs, action = sample_obs(task, 20, 20), 0.1 * sample_action(task, 20, 20)
     obs[:] = math.nan
     if isinstance(task.constraint, Box | Ball) or task is TASKS["disc"]:
-        return  # they do not look at it
+        return  # these sets do not depend on the observation
     for function in (task.constraint.project, task.constraint.alpha_map, task.constraint.radial_map):
         assert function(obs, action).isnan().any(-1).all()
 

@@ -1,4 +1,4 @@
-"""Copies of environments and robots go on as the originals do, and what a simulator holds goes with its object."""
+"""Copies of environments and robots continue like the originals, and a simulator's memory is freed with its object."""
 
 import copy
 import gc
@@ -30,7 +30,7 @@ every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 
 
 class Mass(envs.Robot):
-    """A point on a line with views of its memory and a generator, as simulators have them; neither can be pickled."""
+    """A point on a line with a generator and views of its own memory, as in simulators; neither can be pickled."""
 
     obs_dim, action_dim, max_episode_steps, fps = 3, 2, 30, 10
 
@@ -76,7 +76,7 @@ def own_tasks(monkeypatch):
 
 
 def answers(env, rng, steps):
-    """What `env` answers to random actions, from which it resets by itself."""
+    """The answers of `env` to random actions, with resets at the ends of episodes, and its counters."""
     numbers = []
     for _ in range(steps):
         action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32 if rng.random() < 0.5 else np.float64)
@@ -137,10 +137,10 @@ def test_a_copied_environment_goes_on_bit_for_bit(task, state, way, own_tasks):
     expected = answers(env, np.random.default_rng(0), 60)
     assert len(np.unique(expected[0], axis=0)) > 40  # it moves
     same(answers(twin, np.random.default_rng(0), 60), expected)
-    same(answers(middle, np.random.default_rng(0), 60), expected)  # and the two did not disturb each other
+    same(answers(middle, np.random.default_rng(0), 60), expected)  # the copies did not disturb each other
 
 
-@pytest.mark.parametrize("way", [*WAYS.values()][:3], ids=[*WAYS][:3])  # a shallow copy of a wrapper wraps the same
+@pytest.mark.parametrize("way", [*WAYS.values()][:3], ids=[*WAYS][:3])  # a shallow copy would wrap the same env
 @pytest.mark.parametrize("options", [{}, {"max_episode_steps": 20}])
 @pytest.mark.parametrize("task", ["R-T", "W-M"])
 def test_through_gymnasiums_wrappers(task, options, way):
@@ -187,7 +187,7 @@ def test_a_picture_changes_nothing():
     env, twin = (envs.make("W+M", project=True, render_mode="rgb_array") for _ in range(2))
     for each in (env, twin):
         go_to(each, "middle")
-    env.robot._place_bodies()  # what a picture computes
+    env.robot._place_bodies()  # as a picture does
     same(answers(env, np.random.default_rng(0), 50), answers(twin, np.random.default_rng(0), 50))
 
 
@@ -211,7 +211,7 @@ def test_a_copy_of_a_closed_environment_is_closed(way):
 
 
 class Precise(Mass):
-    """Computes in the precision of its actions."""
+    """A mass that computes in the precision of its actions."""
 
     def step(self, action):
         self.view += np.square(action) / 3
@@ -219,7 +219,7 @@ class Precise(Mass):
 
 
 def test_repeated_actions_keep_their_precision(monkeypatch):
-    """With `project`, an episode mixes float32 actions and projections in float64."""
+    """With `project`, an episode mixes float32 actions with float64 projections."""
     monkeypatch.setitem(envs.TASKS, "precise", envs.Task(Precise, WeightedL1(lambda o: o[..., :2], 0.2, 2), "", "", 9))
     env, other = envs.make("precise", project=True), envs.make("precise", project=True)
     env.reset(seed=0)

@@ -277,7 +277,7 @@ def test_what_properties_use_counts_and_what_they_keep_does_not(monkeypatch):
 
 
 def test_modules_count_wherever_they_are_imported(tmp_path, monkeypatch):
-    """At the call, around the function, and where two of them import each other."""
+    """Modules imported in the call or outside the function, and modules that import each other."""
     (tmp_path / "own_rows").mkdir()
     (tmp_path / "own_rows" / "__init__.py").write_text("from own_rows import table\nBOUND = 1.0\n")
     (tmp_path / "own_rows" / "table.py").write_text("import own_rows\nROWS = 1\n")
@@ -394,7 +394,7 @@ class Pair(NamedTuple):
 
 
 def test_what_python_adds_to_a_class_does_not_count(tmp_path):
-    """It is another in each version of Python."""
+    """Each version of Python adds something else."""
     found = describe({"value": Scaled(), "pair": Pair})
     assert {key for key in found if "class" in key} == {
         "class Scaled", "class Scaled.factor", "class Scaled.__call__", "class Side", "class Side.LEFT",
@@ -410,7 +410,7 @@ def test_the_folder_of_a_file_does_not_count(tmp_path):
 
 
 def test_a_program_without_a_file(tmp_path):
-    """What comes from a pipe has no source; its code still counts, and the order of a set does not."""
+    """Code from a pipe has no source file. It still counts, but the order of a set does not."""
     program = """
 import json
 from constraints import WeightedL1
@@ -436,7 +436,7 @@ print(json.dumps(describe({"value": WeightedL1(lambda obs: obs + (mode in {"a", 
 
 
 def test_libraries_outside_of_the_environment_are_libraries(tmp_path, monkeypatch):
-    """As on clusters, whose modules put their own folders of packages into PYTHONPATH."""
+    """For example on clusters, whose modules put their own package folders into PYTHONPATH."""
     folder = tmp_path / "apps" / "site-packages"
     folder.mkdir(parents=True)
     (folder / "far_library.py").write_text("def f(x):\n    return x\n")
@@ -465,7 +465,7 @@ def test_libraries_in_a_folder_of_their_own_are_libraries_and_what_lies_beside_t
 
 @pytest.fixture
 def define_task():
-    """Gives the task R+X a constraint, and a robot where it is not Reacher."""
+    """A function that gives the task R+X a constraint and, unless it is Reacher, a robot."""
 
     def give(*args):
         TASKS.pop("R+X", None)
@@ -563,7 +563,7 @@ def test_a_run_does_not_resume_under_another_definition(tmp_path, capsys, define
 
 @pytest.fixture
 def name_algorithm():
-    """Gives the name DMine to an agent."""
+    """A function that registers an agent under the name DMine."""
 
     def give(agent):
         ALGORITHMS.pop("DMine", None)
@@ -586,7 +586,7 @@ def test_an_algorithm_of_ones_own_has_a_definition_too(tmp_path, capsys, name_al
 
 
 def test_runs_without_a_definition(tmp_path, capsys, define_task):
-    """Runs of the project's own tasks are older than definitions; of others, nobody knows what they were trained on."""
+    """Such runs of the project's own tasks are older than definitions; for others, the definition is unknown."""
     define_task(Ball(0.05, 2))
     assert run_command(command(tmp_path)) == 0
     for path in tmp_path.rglob("definition.json"):

@@ -72,7 +72,7 @@ def test_radial_log_prob_is_the_jacobian_determinant(name):
 
 
 def exact_ray_integral(slope: float, intercept: float, dim: int) -> tuple[float, float, float]:
-    """log I and its two derivatives by the paper's recursion through erf, whose cancellation 400 digits outlast."""
+    """log I and its two derivatives by the paper's recursion with erf; 400 digits make up for its cancellation."""
     with mpmath.workdps(400):
         a, b = mpmath.mpf(slope), mpmath.mpf(intercept)
         edge = mpmath.exp(-((a + b) ** 2))
@@ -90,7 +90,7 @@ def assert_ray_integral_exact(cases: list[tuple[float, float]], dim: int):
     results = torch.stack(log_ray_integral(slope, intercept, dim), -1)
     for case, result in zip(cases, results.tolist(), strict=True):
         exact = exact_ray_integral(*case, dim)
-        # A rounding of the intercept or of its square is beyond the method's reach: 1e-15 of (A + B)^2.
+        # No method can avoid roundings of the intercept and of its square: 1e-15 (A + B)^2.
         assert result == pytest.approx(exact, rel=1e-9, abs=1e-9 + 1e-15 * sum(case) ** 2), (case, dim)
 
 
@@ -247,8 +247,8 @@ def surface_rule(constraint, obs, center, direction, du) -> tuple[Tensor, Tensor
 
 
 RESOLUTION = {1: (1, 1), 2: (200, 4), 3: (16, 3)}
-# Errors of the rules themselves, measured at 1e-6 (radial, 3-D) and below 1e-10. The edges of a set cost nothing: the
-# mass of a whole ray from the centre is a smooth function of its direction.
+# The measured errors of the rules are 1e-6 (radial, 3-D) and below 1e-10. Edges of a set do no harm, because the mass
+# of a whole ray from the centre is a smooth function of its direction.
 RADIAL_TOLERANCE = {1: 1e-9, 2: 1e-9, 3: 1e-5}
 ALPHA_TOLERANCE = 1e-9
 
@@ -270,7 +270,7 @@ def test_radial_density_integrates_to_one(name, dim, unit_ball):
     mean, std = gaussian(dim)
     direction, du = cone_rule(dim, *RESOLUTION[dim])
     gauge = constraint.gauge(obs, direction, center)
-    # The mapped action has gauge tanh(s); in s the density is smooth, and beyond 16 there is nothing.
+    # The mapped action has gauge tanh(s). The density is smooth in s, and negligible beyond 16.
     s, ds = (16.0 * x for x in radial_rule(32 if dim == 3 else 64))
     action = center + (s / gauge.unsqueeze(-1)).unsqueeze(-1) * direction.unsqueeze(-2)
     log_prob = constraint.ray(obs, action, center).radial_log_prob(normal_log_prob(action, mean, std), unit_ball)
@@ -374,13 +374,13 @@ def test_alpha_density_matches_a_histogram_of_mapped_samples(name):
     observed = torch.cat((observed, samples - observed.sum(0, keepdim=True)))
     statistic = ((observed - expected) ** 2 / expected).sum().item()
     assert expected.min() > 20.0
-    # chi-square of 4 bins degrees of freedom; four standard deviations, for a fixed seed
+    # chi-square with `4 * bins` degrees of freedom, plus four standard deviations; the seed is fixed
     assert statistic < 4 * bins + 4.0 * math.sqrt(8.0 * bins)
 
 
 @pytest.mark.parametrize("name", SETS)
 def test_unit_ball_density_is_that_of_the_coordinates(name):
-    """In six dimensions, where integrals are out of reach: against the Jacobian of y = L(v) v / |v| by autograd."""
+    """In six dimensions, where integrals cost too much: against the Jacobian of y = L(v) v / |v| by autograd."""
     dim = 6
     constraint, center = feasible_sets(dim)[name]
     obs = observation(dim)

@@ -1,7 +1,7 @@
-"""Every operation stays on the device of its tensors: nothing is asked of it, nothing copied to it, in the hot path.
+"""Every operation stays on the device of its tensors: the hot path reads no values from it and copies none to it.
 
-So they can be captured in a CUDA graph. Where there is no GPU, PyTorch's meta device stands in for one: its tensors
-have no values, so an answer that Python would have to wait for raises an error.
+So a CUDA graph can capture the operations. Without a GPU, PyTorch's meta device stands in for one: its tensors have no
+values, so reading a value raises an error.
 """
 
 import pytest
@@ -49,7 +49,7 @@ def inputs(constraint: Constraint) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class OneDevice(TorchDispatchMode):
-    """Raises when an operation brings values from one device to another."""
+    """Raises an error when an operation moves values from one device to another."""
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         out = func(*args, **(kwargs or {}))

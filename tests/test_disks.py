@@ -1,4 +1,4 @@
-"""Full disks: training continues where it can, and a command that fails says so in one line."""
+"""Full disks: training continues if possible, and a command that fails says so in one line."""
 
 import errno
 import os
@@ -75,7 +75,7 @@ def test_an_error_after_the_last_step_names_the_checkpoint_too(tmp_path, monkeyp
 def test_checkpoints_that_did_not_fit_leave_the_seeds_with_a_moment_that_they_share(
     tmp_path, monkeypatch, unbroken, capsys
 ):
-    """Seed 3's file fits each time, seed 5's never does."""
+    """The files of seed 3 always fit on the disk, those of seed 5 never do."""
     first, second = break_off(tmp_path)
     fsync = os.fsync
 
@@ -117,7 +117,7 @@ def test_after_a_checkpoint_that_did_not_fit_the_one_before_is_whole(tmp_path, m
 
 
 def test_transitions_that_cannot_be_read_leave_the_run_as_it_is(tmp_path, monkeypatch, unbroken):
-    """Tables and parameters go back to the checkpoint only after the transitions of every seed are in memory."""
+    """Tables and parameters are reset to the checkpoint only after the transitions of all seeds have been read."""
 
     def unreadable(checkpoint, *args):
         if "seed=5" in str(checkpoint.path):
@@ -130,7 +130,7 @@ def test_transitions_that_cannot_be_read_leave_the_run_as_it_is(tmp_path, monkey
 
     folders, fill = break_off(tmp_path, calls=200), Checkpoint.fill
     before = left()
-    for folder in folders:  # it has an evaluation more than its checkpoint
+    for folder in folders:  # it has one evaluation more than its checkpoint
         (newest, _), _ = CheckpointFolder(folder).read()
         tables = newest.state()["tables"]
         assert tables["evaluations.csv"].count("\n") < (folder / "evaluations.csv").read_text().count("\n")

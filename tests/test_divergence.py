@@ -1,4 +1,4 @@
-"""A seed that diverges stops with a record, and its neighbours learn, bit for bit, what they would have anyway."""
+"""A seed that diverges stops with a record; the other seeds learn the same bits as without its failure."""
 
 import json
 import math
@@ -22,11 +22,11 @@ WORDS = (
     " train_freq=1 gradient_steps=1"
 )
 BAD = 1  # position of the seed that diverges
-MOMENT = 46  # its gradient step, one with a step of the actor
+MOMENT = 46  # the gradient step in which it diverges; the actor learns in this step
 
 
 def spoil(network, value, seed=BAD, where=...):
-    """What sets weights of the first layer of `network`, in the seed at position `seed`."""
+    """A function that sets weights of the first layer of `network` to `value`, for the seed in position `seed`."""
 
     def how(agent):
         for name, parameter in agent.networks()[network].named_parameters():
@@ -122,7 +122,7 @@ def test_a_failed_run_is_reported_and_not_run_again_unless_asked(tmp_path, monke
 
 @pytest.mark.parametrize("call, recorded", [(300, []), (450, ["seed=5"])])
 def test_after_a_failure_the_others_resume_exactly(tmp_path, monkeypatch, call, recorded):
-    """Interrupted while the best parameters of the failed seed are evaluated, and after that."""
+    """Interrupts the run while the best parameters of the failed seed are evaluated, and after that."""
     words = f"algo=DPre env=R+N {WORDS}"
     train(tmp_path / "sound", words)
     for name, check in (("unbroken", lambda: None), ("spoiled", Breaks(call))):
@@ -144,7 +144,7 @@ def test_the_best_parameters_of_a_failed_seed_get_their_final_evaluation(tmp_pat
     poison(monkeypatch, "DPre", spoil("critic", math.nan))
     assert run_command([*words.split(), f"results={tmp_path / 'spoiled'}"]) == 3
     (failure,) = failures(tmp_path / "spoiled").values()
-    # Training to step 60 leaves the same best parameters, which meet the same final episodes.
+    # Training to step 60 gives the same best parameters, which play the same final episodes.
     expected = outcome(tmp_path / "sound")["seed=5"]["result"]
     assert failure["result"] == {key: expected[key] for key in ("return_mean", "returns", "best_step")}
     assert len(failure["result"]["returns"]) == 3 and failure["executed_actions"] == 86 + 150 + 3 * 150
@@ -162,7 +162,7 @@ def test_all_seeds_may_fail(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("every", [10_000, 60], ids=["", "and a checkpoint comes first"])
 def test_a_parameter_that_no_loss_shows_is_found_before_it_is_evaluated(tmp_path, monkeypatch, every):
-    def how(agent):  # minus infinity into a ReLU
+    def how(agent):  # a ReLU hides minus infinity
         agent.actor.layers[0].bias.data[BAD, 0, 0] = -math.inf
 
     poison(monkeypatch, "DPre", how, at=79)
@@ -193,7 +193,7 @@ def test_a_seed_that_ends_while_another_ones_end_is_recorded_gets_its_final_eval
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 @pytest.mark.parametrize("algo", ["DRad", "DPre", "DPro"])
 def test_a_suggested_action_that_is_not_finite(tmp_path, monkeypatch, algo, value):
-    """An infinite one too, even where a clamp would make it finite."""
+    """Also an infinite one, even if a clamp would make it finite."""
     explore = ALGORITHMS[algo].agent.explore
 
     def spoiled(self, obs, which):
@@ -277,7 +277,7 @@ def test_an_environment_that_breaks_down(tmp_path, monkeypatch, what):
 
     def spoiled(self, action, step):
         obs, reward, *rest = record(self, action, step)
-        # Seed 5 alone stands here at its 30th step.
+        # Only seed 5 is at this place at its 30th step.
         if self.executed_actions == 30 and np.isclose(obs[0], target[0]):
             obs, reward = (obs * math.nan, reward) if what == "observation" else (obs, math.inf)
         return obs, reward, *rest

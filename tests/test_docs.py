@@ -1,4 +1,4 @@
-"""What the documentation says can be done as printed: the afternoon's commands, all links, all figures."""
+"""The documentation works as printed: the afternoon's commands, all links, all figures."""
 
 import configparser
 import json
@@ -17,13 +17,13 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 PROJECT = ("algos", "constraints", "core", "envs", "plots", "store", "sweep", "run.py", "plot.py", "tables.py")
-# Settings of a training, and what the test takes in their place.
+# Settings of a training and the values that the test uses instead.
 SHORTER = {"steps": 300, "learning_starts": 100, "eval_every": 150, "hidden": "16,16"}
 FEW_EPISODES = " eval_episodes=1 final_episodes=1"
 
 
 def shorten(command):
-    """The command with fewer steps and episodes and smaller networks, if it trains at all."""
+    """The command with fewer steps and episodes and smaller networks; unchanged if it does not set `steps`."""
     if " steps=" not in command:
         return command
     for key, value in SHORTER.items():

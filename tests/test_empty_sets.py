@@ -1,4 +1,4 @@
-"""A state in which the set is empty ends its own seed, and says where; the others do not notice."""
+"""A state with an empty set ends its own seed with a message that says where, and does not affect other seeds."""
 
 import json
 import math
@@ -44,7 +44,7 @@ def gaps(monkeypatch):
 
 
 def first_observation(seed, purpose="environment", resets=1):
-    """Of the training, or of an evaluation."""
+    """The observation after `resets` resets of the seed's environment for training or for another `purpose`."""
     env = envs.make("R+N")
     obs = env.reset(seed=stream_seed(seed, purpose))[0]
     for _ in range(resets - 1):
@@ -67,7 +67,7 @@ def sound_seeds(root):
 
 
 class GapAfter:
-    """The observations near `target`, from a gradient step on."""
+    """A test for observations near `target`, which holds from a certain gradient step on."""
 
     def __init__(self, monkeypatch, algo, updates, target):
         self.near, self.count = near(target), 0
@@ -134,9 +134,9 @@ def test_the_others_resume_exactly_after_an_empty_set(tmp_path, monkeypatch, gap
 
 
 def test_all_seeds_may_meet_an_empty_set(tmp_path, gaps):
-    gaps.is_gap = lambda obs: obs[..., 0] > -2  # a cosine: everywhere
+    gaps.is_gap = lambda obs: obs[..., 0] > -2  # this entry is a cosine: true everywhere
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sweep.train.check_training", lambda *_: None)  # it would refuse the task
+        patch.setattr("sweep.train.check_training", lambda *_: None)  # the check would refuse the task
         assert run_command([*f"algo=DRad {WORDS}".split(), f"results={tmp_path}"]) == 3
     assert len(failures(tmp_path)) == 3
     assert all(failure["step"] == 0 and "result" not in failure for failure in failures(tmp_path).values())
@@ -144,7 +144,7 @@ def test_all_seeds_may_meet_an_empty_set(tmp_path, gaps):
 
 def test_an_error_of_no_single_seed_ends_the_run_and_says_where(tmp_path, gaps, capsys):
     words = f"algo=DRad {WORDS} checkpoint_every=10"
-    outcomes = iter([False] * 5 + [True])  # of its calls in gradient steps; all others are sound
+    outcomes = iter([False] * 5 + [True])  # for calls in gradient steps; other calls do not fail
 
     def breaks(obs):
         if obs.dim() == 3 and obs.shape[1] == 24 and next(outcomes, False):

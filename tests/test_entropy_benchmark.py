@@ -40,7 +40,7 @@ def test_uniform_entropy_is_the_log_of_the_volume(bench):
 
 
 def disc_entropy(std):
-    """In unit-ball coordinates, of N(0, std^2 I) in two dimensions after radial squashing y = tanh(|v|) v / |v|."""
+    """Entropy, in unit-ball coordinates, of N(0, std^2 I) in two dimensions after y = tanh(|v|) v / |v| (radial)."""
 
     def integrand(radius):
         log_normal = -0.5 * (radius / std) ** 2 - math.log(2 * math.pi * std**2)
@@ -51,7 +51,7 @@ def disc_entropy(std):
 
 
 def alpha_disc_entropy(std):
-    """The same after the alpha map: density of the Gaussian inside, of the angle on the circle."""
+    """The same after the alpha map: inside it has the density of the Gaussian, on the circle that of the angle."""
     outside = math.exp(-0.5 / std**2)
 
     def integrand(radius):
@@ -70,7 +70,7 @@ def test_the_largest_entropy_on_a_disc(bench, mapping, entropy):
 
 
 def test_volume_and_boundary_scale_apart(bench):
-    """On a disc of radius r, the share of the policy inside gains 2 log r, the share on the circle log r."""
+    """On a disc of radius r, probability inside adds 2 log r to the entropy, probability on the circle log r."""
     radius, obs = 0.05**0.5, reacher_states([0.0])
     constraint = envs.constraint("R+L2")
     ball = bench.largest_entropy(constraint, obs, "radial", unit_ball=True)
@@ -87,7 +87,7 @@ def test_volume_and_boundary_scale_apart(bench):
 
 
 def test_srad_cannot_reach_its_target_on_the_tip_task(bench):
-    """The claim of docs/entropy.md, by a search over all standard deviations that knows no gradients."""
+    """The claim of docs/entropy.md, checked by a gradient-free search over a grid of standard deviations."""
     angles = [0.0, 0.5, 1.0]
     obs, constraint = reacher_states(angles), envs.constraint("R+T")
     found = bench.largest_entropy(constraint, obs, "radial", unit_ball=False)

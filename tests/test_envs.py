@@ -25,10 +25,10 @@ SMALL = 0.05  # actions up to this size are feasible in every task at any state 
 
 
 def gymnasium_v4(name, **kwargs):
-    mujoco.set_mju_user_warning(lambda message: None)  # or it leaves a MUJOCO_LOG.TXT in the repository
+    mujoco.set_mju_user_warning(lambda message: None)  # otherwise it writes a MUJOCO_LOG.TXT
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # "v4 is out of date": it is the one meant
+            warnings.simplefilter("ignore")  # "v4 is out of date": v4 is wanted here
             return gymnasium.make(f"{name}-v4", **kwargs)
     finally:
         mujoco.set_mju_user_warning(None)
@@ -53,7 +53,7 @@ def test_reacher_env_seeds_as_the_original():
 @pytest.mark.parametrize("name, robot_class, task", LOCOMOTION)
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_locomotion_equals_gymnasium_v4(name, robot_class, task, seed):
-    """Whole training-like stretches, falls and resets included, in both precisions, to the last bit."""
+    """Long rollouts as in training, with falls and resets, in both precisions, equal to the last bit."""
     reference, robot = gymnasium_v4(name).unwrapped, robot_class()
     rng, noise = np.random.default_rng(seed), np.random.default_rng(seed + 10)
     np.testing.assert_array_equal(robot.reset(rng), reference.reset(seed=seed)[0])
@@ -81,7 +81,7 @@ def test_locomotion_env_equals_gymnasium_v4_through_the_time_limit(name, robot_c
         obs = env.reset(seed=seed)[0]
         np.testing.assert_array_equal(obs, reference.reset(seed=seed)[0])
         for t in range(1000):
-            env._obs = obs  # past any fall, which only the reference allows
+            env._obs = obs  # go on after a fall, as only the reference allows
             obs, reward, terminated, truncated, info = env.step(draw(noise, env))
             expected = reference.step(info["executed_action"])
             np.testing.assert_array_equal(obs, expected[0])
@@ -126,7 +126,7 @@ def test_frame_rate_is_real_time(robot_class):
 
 
 def joint_angles_and_velocities(env):
-    """theta and w (d,) of the driven joints, looked up by joint in the simulator rather than by index in obs."""
+    """theta and w (d,) of the driven joints, read from the simulator by joint, not from obs by index."""
     robot = env.robot
     if isinstance(robot, Reacher):
         return np.array(robot.state[:2]) * (1, 1 / 3), 0.1 * np.array(robot.state[2:4])
@@ -137,7 +137,7 @@ def joint_angles_and_velocities(env):
 
 
 def excess(task, a, theta, w):
-    """The constraints of the paper's table at actions (n, d), each as left side over bound minus 1, (n, k)."""
+    """The k constraints of the paper's table at actions (n, d), as left side / bound - 1 (n, k)."""
     l1, positive = np.abs(w * a).sum(-1), np.maximum(w * a, 0).sum(-1)
     ellipse = (a**2 * np.sin(theta) ** 2).sum(-1)
     a1, a2 = a[:, 0], a[:, 1]
@@ -176,9 +176,9 @@ def test_feasible_set_is_the_papers(task):
     env, rng = envs.make(task, project=True), np.random.default_rng(0)
     infeasible = set()
     for t in range(600):
-        if t % 100 == 0:  # past any fall: that is where the velocities are
+        if t % 100 == 0:  # not after falls, which bring large velocities
             obs, _ = env.reset(seed=t)
-        if t % 20 == 0:  # one push for a while, the longer for the constraint to matter
+        if t % 20 == 0:  # keep a push for a while, so that the constraint matters
             push = rng.choice([-1.0, 1.0], env.action_space.shape)
         # actions of every length, many at corners of the box, some beyond it
         actions = rng.normal(0, 1.5, (64, *env.action_space.shape)).clip(-1, 1) * rng.uniform(0, 1.1, (64, 1))
@@ -188,7 +188,7 @@ def test_feasible_set_is_the_papers(task):
         np.testing.assert_array_equal((violation <= 0)[clear], (sides <= 0).all(-1)[clear])
         infeasible.update(np.flatnonzero((sides > 0).any(0)))
         obs = env._obs = env.step(push)[0]
-    assert infeasible == set(range(sides.shape[1]))  # the box and every constraint were exceeded somewhere
+    assert infeasible == set(range(sides.shape[1]))  # the box and every constraint were violated somewhere
     env.close()
 
 
@@ -196,7 +196,7 @@ def test_feasible_set_is_the_papers(task):
 
 
 def reach_an_infeasible_action(env, rng):
-    """Drive `env` by feasible actions to a state with a clearly infeasible one inside the box; return that."""
+    """Drive `env` by feasible actions to a state with a clearly infeasible action in the box. Returns that action."""
     obs, _ = env.reset(seed=1)
     for _ in range(1000):
         corners = torch.from_numpy(rng.choice([-1.0, 1.0], (64, env.action_space.shape[0])))
@@ -235,7 +235,7 @@ def test_infeasible_action_is_refused_and_projected_on_request(task):
     assert np.abs(expected - action).max() > 1e-3
     assert env.executed_actions == count + 1
     assert env.largest_violation <= envs.TOLERANCE
-    assert not np.array_equal(obs, before.numpy())  # it was executed after all
+    assert not np.array_equal(obs, before.numpy())  # the projection was executed
     env.close()
 
 
@@ -252,7 +252,7 @@ def test_tolerance_and_bookkeeping():
     with pytest.raises(envs.InfeasibleActionError):
         env.step(np.array([1 + 1.1e-6, 0.0]))
     env.reset()
-    assert (env.executed_actions, env.elapsed_steps) == (2, 0)  # the check's record outlives the episode
+    assert (env.executed_actions, env.elapsed_steps) == (2, 0)  # the count continues over episodes
     env.close()
 
 
@@ -294,7 +294,7 @@ def test_what_is_no_action_is_refused(project):
 
 @pytest.mark.parametrize("task", NAMES)
 def test_stepped_together_each_does_what_it_does_alone(task):
-    """Three environments, the last one projecting, under actions feasible and not, of two precisions, and none."""
+    """Three environments, the last one projecting, with feasible, infeasible and invalid actions in two precisions."""
     together, alone = ([envs.make(task, project=i == 2) for i in range(3)] for _ in range(2))
     for group in (together, alone):
         for seed, env in enumerate(group):
@@ -342,7 +342,7 @@ def test_a_violation_does_not_depend_on_which_others_are_computed_with_it(task):
 def test_what_cannot_be_stepped_together():
     first, second, other = envs.make("R+N"), envs.make("R+N"), envs.make("R+L2")
     first.reset(seed=0), other.reset(seed=0)
-    for group in ([first, other], [first, first]):  # a constraint, or an observation, that is not that of the action
+    for group in ([first, other], [first, first]):  # two constraints; one environment twice
         with pytest.raises(ValueError, match="different environments of one constraint"):
             envs.step_together(group, np.zeros((2, 2)))
     with pytest.raises(gymnasium.error.ResetNeeded):
@@ -364,7 +364,7 @@ def test_gymnasium_checker(task, project):
     assert type(env) is type(envs.make(task))
     assert env.observation_space.dtype == np.float64
     assert env.action_space == gymnasium.spaces.Box(-1, 1, (env.constraint.dim,), np.float32)
-    if not project:  # the checker executes what it samples, which has to be feasible then
+    if not project:  # the checker executes its samples, so all must be feasible
         env.action_space = gymnasium.spaces.Box(-SMALL, SMALL, env.action_space.shape, np.float32)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="(?!.*(infinity|recommend|render))")
@@ -445,7 +445,7 @@ env.close()
 
 
 def picture(env):
-    """A picture, or None where this machine has no OpenGL backend, which the error then has to say."""
+    """A picture, or None if this machine has no OpenGL backend and the error says so."""
     try:
         frame = env.render()
     except RuntimeError as error:
@@ -492,7 +492,7 @@ def test_no_opengl_backend_is_a_clear_error(monkeypatch):
     monkeypatch.setattr("ctypes.util.find_library", lambda library: None)
     with pytest.raises(RuntimeError, match="libegl1 or libosmesa6"):
         env.render()
-    env.step(np.zeros(3))  # training goes on
+    env.step(np.zeros(3))  # training continues
     env.close()
 
 
@@ -500,7 +500,7 @@ def test_no_opengl_backend_is_a_clear_error(monkeypatch):
 
 
 def rollout(env, rng, steps):
-    """Step with random actions, resetting where an episode ends; all that the environment answers."""
+    """Step with random actions and reset at the ends of episodes. Returns all answers of the environment."""
     answers = []
     for _ in range(steps):
         obs, reward, terminated, truncated, _ = env.step(SMALL * draw(rng, env).astype(np.float32))
@@ -520,7 +520,7 @@ def test_an_environment_goes_on_bit_for_bit_from_a_saved_state(task, steps, tmp_
     torch.save(env.get_state(), tmp_path / "state.pt")
     actions = rng.bit_generator.state
     wanted = rollout(env, rng, 200)
-    other.reset(seed=2)  # another past must not show
+    other.reset(seed=2)  # another past must have no effect
     rollout(other, np.random.default_rng(9), 77)
     other.set_state(torch.load(tmp_path / "state.pt", weights_only=True))
     rng.bit_generator.state = actions
@@ -532,7 +532,7 @@ def test_an_environment_goes_on_bit_for_bit_from_a_saved_state(task, steps, tmp_
 
 @pytest.mark.parametrize("task", ["R+N", "HC+MA"])
 def test_an_episode_does_not_depend_on_those_before_it(task):
-    """Saved states rest on this; the actions drive the arm against its limits and the robot onto its back."""
+    """Saved states rely on this. The actions drive the arm against its limits and the robot onto its back."""
     rng = np.random.default_rng(0)
     env, fresh = envs.make(task, project=True), envs.make(task, project=True)
     env.reset(seed=1)

@@ -1,4 +1,4 @@
-"""Evaluation: episodes stepped together return what each returns by itself."""
+"""Evaluation: episodes that are stepped together have the same returns as each one alone."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ SEEDS, EPISODES = (3, 5, 8), 2
 def policy(task, spoiled=None):
     """A feasible policy, linear in the observation and different for each seed.
 
-    Its action is NaN for the seed in position `spoiled` at its first episode's 21st step.
+    For the seed in position `spoiled`, the first episode's 21st action is NaN.
     """
     constraint, calls = envs.constraint(task), []
 
@@ -31,7 +31,7 @@ def policy(task, spoiled=None):
 
 
 def one_by_one(task, act):
-    """The returns, the environments and the refusal of each seed, from a loop over `env.step`."""
+    """The returns, the environments and the seeds' error messages, from a loop over `env.step`."""
     robots = [[envs.make(task) for _ in range(EPISODES)] for _ in SEEDS]
     obs, returns, refused = [], np.zeros((len(SEEDS), EPISODES)), {}
     for seed, row in zip(SEEDS, robots, strict=True):
@@ -53,7 +53,7 @@ def one_by_one(task, act):
     return returns, [env for row in robots for env in row], refused
 
 
-@pytest.mark.parametrize("task", ["R+L2", "W+M"])  # (walkers fall, each after a number of steps of its own)
+@pytest.mark.parametrize("task", ["R+L2", "W+M"])  # walkers fall after different numbers of steps
 @pytest.mark.parametrize("spoiled", [None, 1])
 def test_episodes_stepped_together_return_what_single_steps_do(task, spoiled):
     evaluator = Evaluator(lambda: envs.make(task), SEEDS, EPISODES, envs.step_together, stop_if_asked=lambda: None)

@@ -1,4 +1,4 @@
-"""The flow of DFlow and SFlow: a bijection with an exact density, its training, and the map that it makes."""
+"""The flow of DFlow and SFlow: a bijection with an exact density, its training, and the map made from it."""
 
 import math
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ CONSTRAINT = WeightedPositivePart(lambda obs: 2.0 * obs[..., :2] + 3.0, 0.8, 2)
 
 
 def random_flow(dim, features=2, seed=0, double=True):
-    """A flow with random weights, which bends the box by its own size, and no standardisation that is trivial."""
+    """A flow with random weights, which distorts the box strongly, and with nontrivial standardisation."""
     flow = ConditionalFlow(dim, features, 8, torch.Generator().manual_seed(seed))
     generator = torch.Generator().manual_seed(seed + 1)
     with torch.no_grad():
@@ -134,7 +134,7 @@ def test_the_map_projects_what_the_flow_leaves_outside():
 
 
 def test_the_density_of_decoded_actions_integrates_to_one():
-    """That of the flow before the projection, on a grid over all that it can reach; the next test has the map's."""
+    """The density of the flow before the projection, on a grid over its whole range. The next test is for the map."""
     map, obs = flow_map(), torch.tensor([0.3, -0.2, 0.0])
     flow, features = map._on(torch.device("cpu")).double(), CONSTRAINT.features(obs)
     edge = torch.linspace(-12, 12, 2401, dtype=torch.float64)
@@ -220,7 +220,7 @@ def test_agents_do_not_share_the_map_of_the_table():
     assert all(torch.equal(agents[1].map.state()[name], value) for name, value in agents[0].map.state().items())
 
 
-# ---------------------------------------------------------------- what a set depends on
+# ---------------------------------------------------------------- features of a set
 
 
 def test_features_are_what_the_set_depends_on():
@@ -229,7 +229,7 @@ def test_features_are_what_the_set_depends_on():
     assert torch.equal(envs.constraint("HC+O").features(obs), obs[:, 11:17])
     assert envs.constraint("R+T").features(obs).shape == (5, 3)
     assert envs.constraint("W+O+S").features(obs).shape == (5, 12)
-    ball = Ball(lambda obs: 0.1 + obs[..., 0] ** 2, 5)  # whose scales are constants: five, as there are observations
+    ball = Ball(lambda obs: 0.1 + obs[..., 0] ** 2, 5)  # five constant scales, as many as observations
     assert torch.equal(ball.features(obs), 0.1 + obs[:, :1] ** 2) and ball.features(obs[0]).shape == (1,)
     assert Box(3).features(obs[0]).shape == (0,)
 
@@ -287,7 +287,7 @@ def test_measures_are_of_states_that_the_training_has_not_seen():
     same, seen, unseen = (FlowTraining(flow, CONSTRAINT, obs) for obs in (first, other_test, other_training))
     assert torch.equal(same.obs, seen.obs) and not torch.equal(same.test_obs, seen.test_obs)
     assert torch.equal(same.test_obs, unseen.test_obs) and not torch.equal(same.obs, unseen.obs)
-    assert same.test_obs.min() > -3 and seen.test_obs.min() > 3  # they are held-out states, moved from their own mean
+    assert same.test_obs.min() > -3 and seen.test_obs.min() > 3  # held-out states, moved from their own mean
 
 
 @pytest.mark.usefixtures("few_states")
@@ -298,7 +298,7 @@ def test_the_learning_rate_falls_along_a_cosine_and_steps_are_cut():
         training.advance()
         used.append(training.optimizer.param_groups[0]["lr"])
         norm = torch.stack([parameter.grad.norm() for parameter in training.parameters]).norm()
-        assert float(norm) == pytest.approx(flow_training.LARGEST_STEP, rel=1e-4)  # so steep is this loss
+        assert float(norm) == pytest.approx(flow_training.LARGEST_STEP, rel=1e-4)  # this loss is so steep
     assert used == pytest.approx([1e-3, 0.5e-3 * (1 + 0.5**0.5), 0.5e-3, 0.5e-3 * (1 - 0.5**0.5)])
 
 
@@ -309,7 +309,7 @@ def test_the_origin_has_no_face():
 
 @pytest.mark.usefixtures("few_states")
 def test_samples_of_a_training_are_uniform():
-    """The first feasible try, or, where all of them fail, `Constraint.sample`."""
+    """A sample is the first feasible try or, if all tries fail, one of `Constraint.sample`."""
     thin = WeightedL1(lambda obs: 0 * obs[..., :2] + torch.tensor([30.0, 1.0]), 0.3, 2)  # |30 a_1| + |a_2| <= 0.3
     training = FlowTraining(Flow("mle"), thin, states())
     assert thin.violation(training.obs, training.actions).max() <= 0
@@ -391,12 +391,12 @@ def test_states_whose_set_would_be_empty_further_out_stay_where_they_are():
     rows = Rows(dim=2, on_empty="least")
     training = FlowTraining(Flow(), rows, states())
     assert rows.least_violation(training.obs).max() == 0.0
-    assert training.obs[:, 1].abs().max() > 0.8  # the others are further out
+    assert training.obs[:, 1].abs().max() > 0.8  # the other states do move further out
 
 
 @pytest.mark.usefixtures("few_states")
 def test_a_closed_form_tells_that_it_breaks_down_there():
-    """Its coefficients are checked however many calls there were, and in the process's own way again afterwards."""
+    """Its coefficients are checked even after many calls; afterwards the process's own mode of checks is restored."""
     ball = Ball(lambda obs: 0.8 - obs.square().sum(-1), 2)  # positive up to the corners of the cube
     for _ in range(200):
         ball.features(torch.zeros(1, 3))

@@ -49,16 +49,16 @@ def folder_of(root, words=WORDS):
 
 
 def clock(sleep):
-    """In the place of the module `time`."""
+    """A stand-in for the module `time`."""
     return SimpleNamespace(sleep=sleep, perf_counter=time.perf_counter)
 
 
 @pytest.mark.parametrize("words", [WORDS, SAC_WORDS], ids=["DFlow", "SFlow"])
 def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path, capsys, words):
-    """In random play, in the training of the flow, in warm-up, between gradient steps, in evaluations."""
+    """Interrupts random play, the training of the flow, warm-up, gradient steps and evaluations."""
     whole = Breaks()
     train(tmp_path / "whole", words, whole)
-    # After the first break, random play is done at some 15 calls, and the flow's training at some 40.
+    # After the first break, random play ends after about 15 calls, and the flow's training after about 40.
     check = Breaks(5, 30, *range(60, whole.calls, whole.calls // 9))
     assert train_through(tmp_path / "broken", words, check) >= 8
     said = capsys.readouterr().err
@@ -70,11 +70,11 @@ def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path,
     first, second = (load_tensors(folder / "flow.pt")["state"] for folder in (one, other))
     assert all(torch.equal(first[name], second[name]) for name in first)
     first, second = (np.loadtxt(folder / "training.csv", delimiter=",", skiprows=1) for folder in (one, other))
-    assert np.array_equal(np.delete(first, 1, axis=1), np.delete(second, 1, axis=1))  # but for the seconds
+    assert np.array_equal(np.delete(first, 1, axis=1), np.delete(second, 1, axis=1))  # all but the seconds
 
 
 def test_a_seed_learns_the_same_alone_and_in_lockstep(tmp_path):
-    """They share the flow, and nothing else."""
+    """Seeds share the flow and nothing else."""
     for root, seeds in (("together", "3,5"), ("alone", "5")):
         train(tmp_path / root, SAC_WORDS.replace("3,5", seeds))
     last = {}
@@ -98,7 +98,7 @@ def test_a_flow_is_trained_once_for_a_task_and_settings(tmp_path, monkeypatch):
     train(tmp_path, f"{WORDS} flow=mle")
     train(tmp_path, f"{WORDS} flow_steps=21")
     assert len(flow_folders(tmp_path)) == 3
-    monkeypatch.setattr(envs.TASKS["R+O10"].constraint, "bound", 0.9)  # its definition, which is all that counts
+    monkeypatch.setattr(envs.TASKS["R+O10"].constraint, "bound", 0.9)  # changes the definition
     train(tmp_path, WORDS.replace("3,5", "8"))
     assert len(flow_folders(tmp_path)) == 4
 
@@ -129,7 +129,7 @@ def test_a_training_is_measured_twenty_times_at_most(tmp_path, steps):
 
 
 def test_a_run_keeps_its_flow(tmp_path):
-    """A policy needs the folder of the run and nothing else; training.csv tells how much is projected."""
+    """A policy needs the folder of the run and nothing else; training.csv has the projected share."""
     train(tmp_path, f"{WORDS} flow=mle")
     obs = np.random.default_rng(0).normal(size=(40, 9))
     (run, _) = find_runs(tmp_path)
@@ -144,7 +144,7 @@ def test_a_run_keeps_its_flow(tmp_path):
 
 
 def test_training_csv_has_the_share_that_is_projected(tmp_path, monkeypatch):
-    """It is that of decoded actions, not of the points of the box that the actor suggests."""
+    """The share counts decoded actions, not the points of the box that the actor suggests."""
     monkeypatch.setattr(Flow, "propose", lambda self, constraint, obs, suggested: 0.0 * suggested + 5.0)
     train(tmp_path, WORDS.replace("3,5", "3"))
     (run,) = find_runs(tmp_path)
@@ -226,7 +226,7 @@ def test_a_flow_that_leaves_much_outside_is_noted(tmp_path, monkeypatch, capsys)
 
 
 def test_the_checkpoint_of_a_flow_cannot_be_written(tmp_path, monkeypatch, capsys):
-    """The training of the flow goes on without it."""
+    """The training of the flow continues without it."""
 
     def full(path, write):
         if path.name in ("checkpoint.pt", "training.csv"):
@@ -247,7 +247,7 @@ def test_play_at_random_stays_feasible_and_repeats_itself():
     config = config_of("algo=DFlow env=H+M")
     first, second = (flows.random_play(config, lambda: None) for _ in range(2))
     assert torch.equal(first, second) and first.shape == (400, 11) and first.isfinite().all()
-    assert first[:, 8:11].std() > 1.0  # it moves
+    assert first[:, 8:11].std() > 1.0  # the robot moves
     assert len(first) > flow_training.HELD_OUT
 
 
@@ -268,7 +268,7 @@ def test_a_setting_of_the_other_training_is_refused(how, other, capsys):
 
 
 def test_sets_that_are_empty_somewhere(tmp_path, monkeypatch, capsys):
-    """The least violating actions are a face of the box where the second joint is fast."""
+    """If the second joint is fast, the least violating actions are a face of the box."""
 
     class Rows(LinearConstraint):
         def A(self, obs):
@@ -317,7 +317,7 @@ def test_the_benchmark_has_curves_and_the_published_recipe(capsys):
     curve = bench_rows(capsys, "every=10")
     assert [row[1:3] for row in curve] == [[way, step] for way in ("reverse", "mle") for step in ("0", "10", "20")]
     (first,) = bench_rows(capsys, "flow=mle", "every=10", "stop=0.01")
-    assert first == curve[3][:3] + first[3:4] + curve[3][4:]  # untrained, but for the seconds
+    assert first == curve[3][:3] + first[3:4] + curve[3][4:]  # the untrained row, all but the seconds
     published = bench_rows(capsys, "recipe=published", "flow=reverse", "flow_steps=20", "every=10")
     assert [row[2] for row in published] == ["0", "10", "20"] and published[2][4:] != curve[2][4:]
 

@@ -47,7 +47,7 @@ def centers(task: Task, obs: Tensor) -> list[Tensor | None]:
     return [None, interior_point(task, obs, 5)]
 
 
-# ---------------------------------------------------------------- where the map goes
+# ---------------------------------------------------------------- the image of the map
 
 
 @every_task
@@ -181,7 +181,7 @@ def test_log_prob_is_the_jacobian_s_determinant_on_every_task(task):
 
 
 def test_unit_ball_coordinates():
-    """Every set is the unit ball there: the density is that of y = max_i |u_i| u / |u|, whatever the set."""
+    """In these coordinates every set is the unit ball: the density is that of y = max_i |u_i| u / |u|."""
     obs, u = observation(3), in_box(30, 3, 4)[8:]
     zero = torch.zeros(len(u), dtype=torch.float64)
     expected = [-torch.linalg.slogdet(jacobian(lambda a: a.abs().amax() * a / a.norm(), each)).logabsdet for each in u]
@@ -227,7 +227,7 @@ def test_gradients_are_exact_on_general_sets(shape):
 @every_set
 @pytest.mark.parametrize("unit_ball", [False, True], ids=["actions", "unit ball"])
 def test_gradients_through_reparametrised_sampling(name, unit_ball):
-    """As SAC takes them: one ray, and action and log-density of u = tanh(mean + std noise)."""
+    """As in SAC: one ray for action and log-density of u = tanh(mean + std noise)."""
     constraint, center = feasible_sets(3)[name]
     obs = observation(3)
     noise = torch.randn(8, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
@@ -321,7 +321,7 @@ def test_leading_shapes_and_dtypes(task):
     assert both(obs[:0], u[:0]).shape == (0, dim + 1)
     single = both(obs.float(), u.float())
     assert single.dtype == torch.float32
-    assert constraint.gauge_log_prob(obs, u.float(), u.sum(-1)).dtype == torch.float64  # as the log-density given
+    assert constraint.gauge_log_prob(obs, u.float(), u.sum(-1)).dtype == torch.float64  # as the given log-density
     torch.testing.assert_close(single.double(), both(obs.float().double(), u.float().double()), rtol=1e-5, atol=1e-5)
 
 
@@ -339,7 +339,7 @@ def test_nan_is_passed_on(task):
     assert task.constraint.gauge_map(obs, infinite).isnan().all()
 
 
-@pytest.mark.parametrize("name", sorted({*TASKS} - {"R+N", "R+L2", "disc"}))  # these do not look at it
+@pytest.mark.parametrize("name", sorted({*TASKS} - {"R+N", "R+L2", "disc"}))  # these ignore the observation
 def test_nan_in_the_observation_is_passed_on(name):
     task = TASKS[name]
     obs, u = torch.full((20, 2 * task.constraint.dim), math.nan).double(), in_box(20, task.constraint.dim)
@@ -349,7 +349,7 @@ def test_nan_in_the_observation_is_passed_on(name):
 
 @every_task
 def test_it_asks_nothing_of_the_device(task):
-    """PyTorch's meta device stands in for a GPU, as in test_device: it has no values to answer with."""
+    """PyTorch's meta device stands in for a GPU, as in test_device: reading a value raises an error."""
     obs, u = sample_obs(task, 10, 30).to("meta"), in_box(10, task.constraint.dim).to("meta").requires_grad_()
     for center in (None, task.constraint.center(obs)):
         ray = task.constraint.ray(obs, u, center)

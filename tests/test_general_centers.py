@@ -1,4 +1,4 @@
-"""Centres of sets of one's own: unique, continuous in the observation, and deep inside."""
+"""Centres of user-defined sets: unique, continuous in the observation, and deep inside."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def wedge_off_centre(count: int) -> tuple[Tensor, Tensor]:
 
 
 def row_in_and_out(count: int) -> tuple[Tensor, Tensor]:
-    """A third row passes through a corner of the others, which are met by the box at first."""
+    """A third row moves along the edge between the other two, starting beyond the edge's end on the box."""
     shift = torch.linspace(1.2, -0.6, count, dtype=torch.float64)
     rows = torch.tensor([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]], dtype=torch.float64)
     bounds = torch.stack((torch.full_like(shift, 0.4), torch.full_like(shift, 0.3), shift), -1)
@@ -59,7 +59,7 @@ def row_in_and_out(count: int) -> tuple[Tensor, Tensor]:
 
 
 def row_vanishes(count: int) -> tuple[Tensor, Tensor]:
-    """w.a <= 1 with w through 0 in one coordinate, as a velocity does."""
+    """w.a <= -1, where one coordinate of w passes through 0, as a velocity does."""
     w = torch.stack((torch.linspace(-3.0, 3.0, count), torch.full((count,), 4.0), torch.full((count,), -2.0)), -1)
     return w.double().unsqueeze(-2), torch.full((count, 1), -1.0, dtype=torch.float64)
 
@@ -69,7 +69,7 @@ PATHS = [slab, slab_off_centre, wedge, wedge_off_centre, row_in_and_out, row_van
 
 @pytest.mark.parametrize("path", PATHS)
 def test_center_is_continuous(path):
-    """Ten times as many points on the path make the longest step ten times as short."""
+    """Ten times as many points on the path make the longest step ten times shorter."""
     steps = []
     for count in (201, 2001, 20001):
         center = fixed(*path(count)).center(no_obs(count))
@@ -105,7 +105,7 @@ def test_center_is_continuous_where_an_ellipse_is_added(path):
 
 @pytest.mark.parametrize("width", [0.3, 1e-3, 1e-6, 3e-8])
 def test_center_of_a_long_ellipse_that_turns_outside_the_box(width):
-    """Its deepest points are along its axis, and many are equally deep."""
+    """The deepest points lie along its axis, and many of them are equally deep."""
 
     def matrix(obs: Tensor) -> Tensor:
         axis, across = torch.stack((obs.cos(), obs.sin()), -1), torch.stack((-obs.sin(), obs.cos()), -1)
@@ -127,7 +127,7 @@ def test_several_centres_for_one_action():
 
 
 def test_a_small_turn_is_a_small_step():
-    """The radial map of one action moves with the slab, as its projection does."""
+    """If the slab turns a little, the image of an action under every map moves only a little."""
     rows, bounds = both_sides(torch.stack((turning(2, 0.01)[1] * 0.5**0.5).unbind(), 0), -0.1, 0.1)
     slab_ = fixed(rows, bounds)
     action = torch.tensor([0.4, -0.9], dtype=torch.float64).expand(2, 2)
@@ -147,7 +147,7 @@ def test_center_does_not_depend_on_the_order_of_the_rows_or_their_scale():
     twice = fixed(torch.cat((rows, rows), 1), torch.cat((bounds, bounds), 1)).center(no_obs(50))
     torch.testing.assert_close(shuffled, expected, rtol=0.0, atol=1e-9)
     torch.testing.assert_close(twice, expected, rtol=0.0, atol=1e-9)
-    # A sample is the same alone and among others.
+    # A sample has the same centre alone and in a batch.
     alone = fixed(rows[7], bounds[7]).center(no_obs(1))
     torch.testing.assert_close(alone[0], expected[7], rtol=0.0, atol=1e-9)
 
@@ -161,7 +161,7 @@ def test_free_joints_stay_at_zero():
 
 
 def largest_radius(constraint: Constraint, obs: Tensor) -> list[float]:
-    """By SciPy, a sample at a time."""
+    """The largest radius of each sample, computed by SciPy."""
     sets = scale_sets(constraint.explicit(obs), obs.shape[:-1])
     solid = (sets.rows != 0.0).any(-1, keepdim=True).double()
     objective = [0.0] * constraint.dim + [-1.0]
@@ -203,7 +203,7 @@ def test_flat_and_empty_sets_have_no_center():
 
 
 def test_oracle_takes_the_sets_that_project_takes():
-    """Rows that miss each other by rounding, given twice, or parallel up to rounding."""
+    """Rows that miss each other by rounding, are given twice, or are parallel up to rounding."""
     cases = [
         ([[1.0, 0.0], [-1.0, 0.0]], [0.0, -1e-9]),
         ([[1.0, 0.0], [-1.0, 0.0], [1.0, 0.0]], [0.5, -0.5, 0.5]),
@@ -215,7 +215,7 @@ def test_oracle_takes_the_sets_that_project_takes():
         constraint = fixed(torch.tensor(rows, dtype=torch.float64), torch.tensor(bounds, dtype=torch.float64))
         best = constraint.linear_oracle(no_obs(), slope)
         assert constraint.violation(no_obs(), best).max() <= 1e-8
-        # Nothing of the set is further along the slope.
+        # No point of the set is further along the slope.
         ahead = constraint.project(no_obs(), best + slope)
         torch.testing.assert_close(
             ((ahead - best) * slope).sum(-1).clamp(min=0.0), torch.zeros(4).double(), atol=2e-8, rtol=0.0
@@ -223,7 +223,7 @@ def test_oracle_takes_the_sets_that_project_takes():
 
 
 def test_center_with_an_ellipse_does_not_jump():
-    """The origin leaves an intersection: the centre moves away from it before."""
+    """The centre moves away from the origin before the origin leaves the intersection."""
     steps = []
     for count in (201, 2001):
         shift = torch.linspace(0.2, -0.2, count, dtype=torch.float64)

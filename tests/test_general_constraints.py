@@ -1,4 +1,4 @@
-"""Sets of a user's own - rows, ellipses, intersections - against a conic solver, closed forms and their definitions."""
+"""User-defined sets (rows, ellipses, intersections) against a conic solver, closed forms and their definitions."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ class Written:
         return problem.value
 
     def projection_error(self, point: np.ndarray, target: np.ndarray) -> float:
-        """A bound on the distance to the projection: that of target - point to the normal cone at the feasible point,
-        in units of the distance where that is large."""
+        """A bound on the distance from the feasible `point` to the projection of `target`: the distance of
+        target - point to the normal cone at `point`, relative to |target - point| if that is above 1."""
         outward = target - point
         distance = np.linalg.norm(outward)
         if distance == 0.0:
@@ -126,7 +126,7 @@ def test_agrees_with_a_conic_solver(shape):
         written, x = Written(constraint, obs, i), target[i].numpy()
         point = projected[i].numpy()
         assert written.projection_error(point, x) <= 1e-9
-        # The solver is 1e-7 off on degenerate ellipses; a feasible point that is nearer than its answer is better.
+        # The solver's error is 1e-7 on degenerate ellipses; a feasible point nearer than its answer is better.
         nearest = written.optimum(lambda a, x=x: cp.sum_squares(a - x), minimize=True)[1]
         assert np.square(point - x).sum() <= nearest + 1e-8
         best = written.optimum(lambda a, x=x: x @ a, minimize=False)[1]
@@ -146,7 +146,7 @@ def test_agrees_with_a_conic_solver(shape):
     far=st.sampled_from([0.1, 1.0, 10.0, 1e3, 1e6]),
     seed=st.integers(0, 2**31),
 )
-# Thin slabs, at whose boundary an interior-point method may come to rest.
+# Thin slabs: an interior-point method may stall at their boundary.
 @example(dim=4, rows=0, ellipses=1, rank=1, scale=1e-3, far=0.1, seed=0)
 @example(dim=4, rows=0, ellipses=3, rank=1, scale=1e-3, far=10.0, seed=59)
 def test_every_method_keeps_its_promise(dim, rows, ellipses, rank, scale, far, seed):
@@ -167,10 +167,10 @@ def test_every_method_keeps_its_promise(dim, rows, ellipses, rank, scale, far, s
     for mapped in (constraint.alpha_map(obs, target), constraint.radial_map(obs, target)):
         assert constraint.violation(obs, mapped).max() <= 1e-8
 
-    # No point of the set found by other means does better than the oracle's.
+    # No other point of the set found here is better than the oracle's.
     extreme = constraint.linear_oracle(obs, target)
     assert constraint.violation(obs, extreme).max() <= 1e-10
-    # The slope is in the normal cone, but for what a proximal step of 1e3 leaves; the loss is its square times 500.
+    # The slope is in the normal cone up to the remainder of a proximal step of 1e3; the loss is 500 times its square.
     ahead = extreme + target / target.norm(dim=-1, keepdim=True)
     for i in range(2):
         assert Written(constraint, obs, i).projection_error(extreme[i].numpy(), ahead[i].numpy()) <= 1e-7
@@ -286,10 +286,10 @@ def jacobian(constraint: Constraint, obs: Tensor, action: Tensor) -> Tensor:
 def test_gradient_at_degenerate_points():
     octahedron = Intersection(WeightedL1(lambda obs: torch.ones(3, dtype=torch.float64), 0.5, 3))
     obs = torch.zeros(1, dtype=torch.float64)
-    # The apex of a pyramid: two of the four rows alone explain the multipliers, but nothing moves.
+    # At the apex of a pyramid, two of the four rows suffice for the multipliers, but the projection does not move.
     axis = torch.tensor([5.0, 0.0, 0.0], dtype=torch.float64)
     torch.testing.assert_close(jacobian(octahedron, obs, axis), torch.zeros(3, 3, dtype=torch.float64))
-    # On an edge of it only the one along the edge.
+    # On an edge, the projection moves only along the edge.
     edge = torch.tensor([2.0, 2.1, 0.0], dtype=torch.float64)
     along = torch.tensor([1.0, -1.0, 0.0], dtype=torch.float64) / math.sqrt(2.0)
     torch.testing.assert_close(jacobian(octahedron, obs, edge), torch.outer(along, along))
@@ -328,7 +328,7 @@ def ball(radius: float, *center: float) -> QuadraticConstraint:
 
 
 def slab(width: float) -> LinearConstraint:
-    """A diagonal slab of the width, so its half is the depth."""
+    """A diagonal slab of this width; its depth is half the width."""
     b = math.sqrt(2.0) * width
     return LinearConstraint(
         2,
@@ -360,7 +360,7 @@ def test_thin_sets_are_told_from_flat_and_empty_ones(constraint, message):
         for method in (*centered, *others):
             assert constraint.violation(obs, method(obs, action)).max() <= 1e-12
     else:
-        # A tiny ball has a projection all the same.
+        # A set without interior still has a projection.
         for method in centered if message == "the set has no interior" else (*centered, *others):
             with pytest.raises(ConstraintError, match=f"sample 0: {message}"):
                 method(obs, action)
@@ -395,7 +395,7 @@ def quadratic(Q, bound: float, center=(0.0, 0.0)) -> QuadraticConstraint:
 def test_extreme_coefficients(constraint, plain):
     action = torch.tensor([[2.0, 0.7], [-1.0, 0.3], [1e6, -3e5], [0.0, -1.1]], dtype=torch.float64)
     obs, center = no_obs(), plain.center(no_obs())
-    # An ellipse as large as 1e6 is half a millionth off a half-space in the box.
+    # In the box, an ellipse of size 1e6 differs from a half-space by half a millionth.
     close = dict(
         rtol=0.0, atol=1e-6 if isinstance(plain, LinearConstraint) and constraint.explicit(obs).ellipses else 1e-10
     )
@@ -443,7 +443,7 @@ def test_nothing_is_kept_or_changed(shape):
     try:
         count = tensors()
         use()
-        assert tensors() == count  # freed by counting references, without the collector's help
+        assert tensors() == count  # freed by reference counting, without the garbage collector
     finally:
         gc.enable()
     for each, copy in zip(inputs, before, strict=True):
@@ -590,7 +590,7 @@ def test_misuse():
 
 @pytest.mark.parametrize("near_face", [1e-1, 1e-2, 1e-3, 1e-4])
 def test_projection_where_the_centre_of_an_ellipse_is_near_a_face(near_face):
-    """The start of the interior-point method is then near the boundary, where it may stall."""
+    """The interior-point method then starts near the boundary, where it may stall."""
     generator = torch.Generator().manual_seed(2)
     n = 500
     spread = 10.0 ** (0.5 * torch.randn(n, 1, 1, generator=generator, dtype=torch.float64) + 0.5)
@@ -600,14 +600,14 @@ def test_projection_where_the_centre_of_an_ellipse_is_near_a_face(near_face):
     constraint = QuadraticConstraint(2, lambda obs: root.mT @ root, 1.0, lambda obs: middle)
     target = 3.0 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
     closest = constraint.project(no_obs(n), target)
-    # Closest means that no point of the set is further along what was cut off.
+    # A point is closest if no point of the set is further along target - point.
     outward = torch.nn.functional.normalize(target - closest, dim=-1)
     furthest = constraint.linear_oracle(no_obs(n), outward)
     assert ((furthest - closest) * outward).sum(-1).max() <= 1e-10
 
 
 def test_a_singular_newton_step_is_no_solution():
-    """Its multipliers are so large that their rounding looks like the solution's."""
+    """Its multipliers are so large that rounding makes them look like those of a solution."""
     scale = [0.0, 0.0015064103909502283, 0.0035943187159001937, 0.0002779760499204668]
     target = [0.5510522904313183, -5.796111446988481, -2.1162425796169337, -2.257719301052732]
     ellipse = DiagonalEllipse(lambda obs: obs.new_tensor(scale), 0.004998776954459892, 4)

@@ -1,4 +1,4 @@
-"""Sets of one's own do not depend on PyTorch's defaults, nor on the mode in which they were first used."""
+"""User-defined sets depend neither on PyTorch's defaults nor on the mode in which they are first used."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def build() -> dict[str, Constraint]:
 
 
 def everything(constraint: Constraint, obs: Tensor, action: Tensor) -> list[Tensor]:
-    """Every method, and gradients by the action where there are any."""
+    """The results of all methods, and their gradients with respect to the action if there are any."""
     names = ("project", "alpha_map", "radial_map", "gauge_map", "violation", "penalty", "linear_oracle")
     results = [getattr(constraint, name)(obs, action) for name in names] + [constraint.center(obs)]
     if torch.is_inference_mode_enabled():

@@ -1,4 +1,4 @@
-"""Sets of one's own that are empty at some observation."""
+"""User-defined sets that are empty at some observations."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def test_samples_that_are_not_empty_stay_as_they_are():
 
 
 def test_a_row_that_no_action_meets_does_not_count():
-    """0 <= -1 is violated by 1 wherever one is; the other row is met."""
+    """The row 0 <= -1 is violated by 1 everywhere; the other row is satisfied."""
     rows = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
     constraint = LinearConstraint(
         2, lambda obs: rows, lambda obs: torch.tensor([-1.0, -0.5]).double(), on_empty="least"
@@ -178,7 +178,7 @@ def test_choices_of_on_empty():
 
 
 class Still(Robot):
-    """Observation (2,): a number of the episode's steps, and 0."""
+    """Observation (2,): a number that falls by 0.2 in each step, and 0."""
 
     obs_dim, action_dim, max_episode_steps, fps = 2, 2, 10, 10
 
@@ -205,7 +205,7 @@ def test_an_environment_admits_the_least_violation(project, monkeypatch):
         env.reset(seed=0)
         inside = env.constraint.project(torch.tensor([0.5, 0.0]).double(), torch.zeros(2).double()).numpy()
         env.step(inside)
-        env.step(inside)  # the set of the second step is flat, of the third one empty: 0.3 <= . <= 0.1
+        env.step(inside)  # the set is flat at the second step, empty at the third: 0.3 <= . <= 0.1
         if on_empty == "error":
             with pytest.raises(ConstraintError if project else InfeasibleActionError):
                 env.step(inside)

@@ -1,4 +1,4 @@
-"""Gradients of sets of one's own with respect to observations and learned coefficients."""
+"""Gradients of user-defined sets with respect to observations and learned coefficients."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def inputs(name: str, count: int = 6) -> tuple[Learned, Tensor, Tensor]:
 
 
 def with_parameters(name: str, method: str):
-    """The method as a function of parameters, observations and the rest."""
+    """The method as a function of parameters, observations and its other arguments."""
 
     def call(theta: Tensor, *rest: Tensor) -> Tensor:
         learned = Learned()
@@ -80,7 +80,7 @@ def with_parameters(name: str, method: str):
 def test_gradients_with_respect_to_observations_parameters_and_actions(name, method):
     learned, obs, action = inputs(name)
     theta = learned.theta.detach().clone().requires_grad_()
-    if method == "violation":  # of a value at the edge of the box the gradient is that of either side
+    if method == "violation":  # at the box's edge, the gradient may be that of either side
         action = (0.6 * action.detach()).requires_grad_()
     assert gradcheck(with_parameters(name, method), (theta, obs, action), **OPTIONS)
 
@@ -103,7 +103,7 @@ def test_projection_of_points_inside_and_far_away(name):
 
 
 def test_parameters_of_a_module_learn_through_a_projection():
-    """A bound is found by gradient descent from projections that it made."""
+    """Gradient descent recovers a bound from projections that were made with it."""
     learned = torch.nn.Linear(1, 1, dtype=torch.float64)
     set_ = LinearConstraint(2, lambda obs: torch.ones(1, 2, dtype=torch.float64), lambda obs: learned(obs))
     obs = torch.linspace(-1.0, 1.0, 20, dtype=torch.float64).unsqueeze(-1)
@@ -157,7 +157,7 @@ def test_a_center_between_guess_and_deepest_point_has_no_gradient():
 
 
 def test_violation_beside_the_box_has_the_whole_gradient():
-    """The box's excess is the only one that counts, and counts once."""
+    """Only the excess over the box counts, and it counts once."""
     action = torch.tensor([1.5, 0.2], dtype=torch.float64, requires_grad=True)
     row = LinearConstraint(
         2, lambda obs: torch.ones(1, 2, dtype=torch.float64), lambda obs: torch.tensor([5.0]).double()

@@ -64,7 +64,7 @@ def test_all_parts_from_measurement_to_tables(bench, tmp_path, capfd):
     agreement = rows_of(tmp_path / "agreement.csv")
     assert {r["algo"] for r in agreement} == set(bench.PAPER) and len(agreement) == 26
     assert all(float(r["rounding"]) > 0 for r in agreement)
-    assert all(float(r["difference"]) == 0 for r in agreement)  # the CPU beside itself
+    assert all(float(r["difference"]) == 0 for r in agreement)  # the CPU is compared with itself
     runs = rows_of(tmp_path / "runs.csv")
     assert [(r["seeds"], r["threads"]) for r in runs] == [*[("1", "1")] * 2, *[("2", "1")] * 2, *[("2", "2")] * 2]
     for record in runs:

@@ -1,7 +1,7 @@
-"""Gradient steps on a GPU: captured once and repeated, with every seed's own random numbers, and never waited for.
+"""Gradient steps on a GPU: captured once and repeated, with every seed's own random numbers and no wait for the GPU.
 
-Without a GPU, a stand-in for CUDA's graphs calls the captured operations again when they are to be repeated, and
-PyTorch's meta device shows that a step asks nothing of its device.
+Without a GPU, a stand-in for CUDA's graphs repeats captured operations by calling them again, and PyTorch's meta device
+shows that a step reads no values from its device.
 """
 
 from contextlib import contextmanager, nullcontext
@@ -32,7 +32,7 @@ needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a C
 
 
 def make(name, task="W+M", device="cpu"):
-    """An agent with small networks and a replay buffer with random transitions that keeps growing."""
+    """An agent with small networks, a replay buffer with random transitions, and a function that adds more."""
     words = ["snapshots_after=1", "snapshot_every=2"] if name == "ARAM" else []
     config = config_of([f"algo={name}", f"env={task}", "hidden=[16,16]", f"batch_size={BATCH}", *words])
     constraint, robot = envs.constraint(task), envs.TASKS[task].robot
@@ -49,7 +49,7 @@ def make(name, task="W+M", device="cpu"):
             reward, terminated = torch.randn(2, 1, generator=generator), torch.zeros(2, 1)
             centers = agent.centers(obs), agent.centers(next_obs)
             replay.add([0, 1], Batch(obs, action, reward, terminated, next_obs, *centers))
-            if name == "ARAM" and device != "meta":  # it has a second buffer
+            if name == "ARAM" and device != "meta":  # ARAM has a second buffer
                 agent.remember([0, 1], obs, uniform.unsqueeze(1), torch.tensor([1, 1]), torch.zeros(2))
 
     grow(20)
@@ -57,7 +57,7 @@ def make(name, task="W+M", device="cpu"):
 
 
 def train(agent, replay, grow):
-    """Gradient steps while the buffer grows and wraps."""
+    """Take gradient steps while the buffer grows and wraps."""
     step = GradientSteps(agent, replay, BATCH)
     for _ in range(STEPS):
         agent.start_rollout([0, 1])
@@ -68,7 +68,7 @@ def train(agent, replay, grow):
 
 
 def check_copies(agent):
-    """Most of ARAM's copies of the critic are made after a graph has been captured."""
+    """Check that ARAM has made its copies of the critic, most of them after a graph has been captured."""
     if isinstance(agent, ARAM):
         assert agent.copies.tolist() == [5, 5] and not agent.missing.any()
 
@@ -78,7 +78,7 @@ def outcome(agent):
 
 
 class FakeGraph:
-    """Repeats by calling what was captured; `capturing` must not take a step, so it is undone."""
+    """Replays by calling the captured function again. `capture` below undoes the step taken while capturing."""
 
     made = 0
 
@@ -173,7 +173,7 @@ def test_a_gradient_step_asks_nothing_of_its_device(name, task):
     on_meta = batch._make(x if x is None else x.to("meta") for x in batch)
     for _ in range(agent.cycle):
         agent.update(batch)
-        there.update(on_meta)  # an answer that Python would have to wait for raises an error
+        there.update(on_meta)  # reading a value raises an error
     assert all(p.device.type == "meta" for module in there.networks().values() for p in module.parameters())
     assert {name: losses.shape for name, losses in there.losses.items()} == {
         name: losses.shape for name, losses in agent.losses.items()
@@ -182,7 +182,7 @@ def test_a_gradient_step_asks_nothing_of_its_device(name, task):
 
 @pytest.mark.parametrize("name, task", [("DPre", "W+M"), ("SPre", "W+M"), ("SRad", "R+L2")])
 def test_repeated_exploration_is_that_of_eager_calls(name, task, monkeypatch):
-    """With a stand-in for a CUDA graph, which calls the function again on the memory of the captured inputs."""
+    """The stand-in for a CUDA graph calls the function again on the memory of the captured inputs."""
 
     class Graph:
         def replay(self):
@@ -199,7 +199,7 @@ def test_repeated_exploration_is_that_of_eager_calls(name, task, monkeypatch):
 
 
 def explored(agent, calls, device="cpu"):
-    """Suggestions of `calls` steps, between which the actor learns; the stream of noise goes on."""
+    """Suggestions of `calls` steps. The actor changes between them, and the stream of noise continues."""
     generator = torch.Generator().manual_seed(1)
     found = []
     for number in range(calls):
@@ -263,7 +263,7 @@ def test_a_run_on_a_gpu_is_interrupted_and_resumed_with_the_same_bits(name, tmp_
 
     def interrupt():
         calls.append(None)
-        if len(calls) == 400:  # of about 500: env steps and gradient steps
+        if len(calls) == 400:  # of about 500, in environment and gradient steps
             raise Interrupted(15)
 
     train(tmp_path / "whole")
@@ -280,7 +280,7 @@ def test_a_run_on_a_gpu_is_interrupted_and_resumed_with_the_same_bits(name, tmp_
 
 
 def test_a_captured_step_goes_on_from_any_moment(cuda_stand_in, monkeypatch):
-    """A checkpoint in the middle of a block holds the streams as they are without blocks."""
+    """A checkpoint in the middle of a block has the same stream states as without blocks."""
     monkeypatch.setitem(globals(), "GradientSteps", cuda_stand_in)
     whole, broken = make("DPre"), make("DPre")
     train(*whole)

@@ -37,7 +37,7 @@ sys.exit(run.main("algo={algo} env={task} seed=3,5 {SETTINGS} results={tmp_path}
 
 
 def test_tables_stand_on_the_standard_library_alone():
-    """The lint rule on imports knows packages only; this file is in none."""
+    """The lint rule on imports covers packages only; tables.py is in none."""
     tree = ast.parse((ROOT / "tables.py").read_text())
     names = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     names |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}

@@ -1,4 +1,4 @@
-"""Sets whose coefficients are learned: environments and trainings take them as they are at the moment."""
+"""Sets with learned coefficients: environments and trainings use their current values."""
 
 import gymnasium
 import numpy as np
@@ -18,7 +18,7 @@ SHORT = "seed=0,1 steps=90 learning_starts=40 batch_size=8 hidden=[8,8] eval_eve
 
 
 def learned(inputs, outputs):
-    """A function of observations with parameters that ask for gradients."""
+    """A function of observations with parameters that require gradients."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         network = torch.nn.Linear(inputs, outputs, dtype=torch.float64)

@@ -23,7 +23,7 @@ def test_a_run_in_progress_is_left_to_its_process(tmp_path, capsys):
         said = f"run.py: {folder} is being trained by process {os.getpid()} on {socket.gethostname()}\n"
         assert err == 2 * said
         assert outcome_files(tmp_path) == before
-    assert not list(tmp_path.rglob("*.lock"))  # the other seed's too
+    assert not list(tmp_path.rglob("*.lock"))  # nor the lock of the other seed
     assert run_command([*CHECKPOINTED.split(), f"results={tmp_path}"]) == 0
 
 
@@ -69,7 +69,7 @@ def test_a_lock_that_its_owner_deletes_meanwhile_is_no_lock(tmp_path, monkeypatc
 
     def race(file, how):
         if not calls:
-            lock.unlink()  # the owner lets go between our opening and our locking
+            lock.unlink()  # the owner deletes it between our opening and our locking
         calls.append(how)
         return flock(file, how)
 

@@ -10,7 +10,7 @@ from sweep.train import make_trainer
 
 
 class RecordingReplay(Replay):
-    """Keeps a checksum of every batch a seed was shown, and each seed's transitions."""
+    """Keeps a checksum of every batch of every seed, and each seed's transitions."""
 
     def sample(self, batch_size):
         batch = super().sample(batch_size)
@@ -18,7 +18,7 @@ class RecordingReplay(Replay):
         return batch
 
 
-# Early copies of the critic, so that they take turns several times.
+# Copies of the critic start early, so that they are replaced several times.
 OWN_SETTINGS = {"ARAM": {"snapshots_after": 50, "snapshot_every": 30}}
 
 
@@ -29,8 +29,8 @@ def configuration(algo, env, seed, **settings):
 
 
 def train(tmp_path, algo, env, seed, **settings):
-    """Train a short run. For each seed a dict: the last parameters, the transitions in the order they were stored, the
-    number of gradient steps, the mean return, and a checksum of the batch of each gradient step."""
+    """Train a short run. Returns a dict for each seed: the last parameters, the transitions in the order of storing,
+    the number of gradient steps, the mean return, and a checksum of the batch of each gradient step."""
     config = configuration(algo, env, seed, **settings)
     seeds = [int(s) for s in str(seed).split(",")]
     writers = [RunWriter(tmp_path / f"{algo}-{seed}" / f"seed={s}", {}, {}, 1) for s in seeds]
@@ -58,7 +58,7 @@ CASES = {
     "SAC with gSDE": ("SRad", "R+M"),
     "NFWPO": ("NFW", "R+L2"),
     # (Much longer runs differ: contact amplifies a rounding error by a factor of ten in some twenty steps.)
-    # Untrained walkers fall after 10 to 50 steps, each seed at times of its own; updates come once an episode.
+    # Untrained walkers fall after 10 to 50 steps, each seed at other times; updates come once an episode.
     "TD3 on Walker2d": ("DAlpha", "W+M"),
     "SAC on Walker2d": ("SAlpha", "W+O+S"),
     "SAC with stored centres": ("SRad", "W+M"),
@@ -70,7 +70,7 @@ def assert_same(alone, among):
     assert among["gradient_steps"] == alone["gradient_steps"]
     assert len(alone["transitions"]) == len(among["transitions"])
     assert len(alone["batches"]) == len(among["batches"]) == alone["gradient_steps"]
-    # The random numbers are the same bits, and so is the data until rounding of the weights reaches it.
+    # The random numbers have the same bits; so have the data, until roundings of the weights affect them.
     assert torch.equal(alone["transitions"][:300], among["transitions"][:300])
     torch.testing.assert_close(alone["transitions"], among["transitions"], rtol=0, atol=1e-3)
     assert alone["batches"] == pytest.approx(among["batches"], abs=1e-2)
@@ -84,16 +84,16 @@ def test_a_seed_learns_the_same_alone_and_among_others(tmp_path, algo, env):
     together = train(tmp_path, algo, env, "1,3,8")
     assert_same(alone, together[3])
     assert alone["gradient_steps"] >= 150
-    # Neighbours are other seeds, not copies.
+    # Neighbours are different seeds, not copies.
     assert not torch.equal(together[1]["transitions"][:300], together[3]["transitions"][:300])
     if env.startswith("W") and configuration(algo, env, "3").train_freq == "episode":
         assert len({together[s]["gradient_steps"] for s in together}) > 1
 
 
 def test_a_seed_that_finishes_late_learns_what_it_learns_alone(tmp_path):
-    """Its neighbours, finished, take part in its last gradient steps without an effect on either."""
+    """Its finished neighbours take part in its last gradient steps, without effect on any seed."""
     together = train(tmp_path, "DAlpha", "W+M", "1,3,8")
-    # All unfinished seeds take every gradient step, so the one with the most finishes last.
+    # All unfinished seeds take every gradient step, so the seed with the most steps finishes last.
     early, *_, late = sorted(together, key=lambda seed: together[seed]["gradient_steps"])
     assert together[early]["gradient_steps"] < together[late]["gradient_steps"]
     for seed in (early, late):

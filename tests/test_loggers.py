@@ -1,6 +1,6 @@
-"""`log=tensorboard,wandb`: what the loggers keep, also over resumptions; a missing package; loggers that fail.
+"""`log=tensorboard,wandb`: what the loggers record, also when a run resumes; a missing package; loggers that fail.
 
-TensorBoard's files are read back with its own reader, and Weights & Biases writes offline, without a network.
+TensorBoard's files are read with its own reader. Weights & Biases writes offline, without a network.
 """
 
 import csv
@@ -29,7 +29,7 @@ MEASURES = {
 
 
 class Crash:
-    """A `stop_if_asked` that breaks the training off once, after the evaluation at `step`."""
+    """A `stop_if_asked` that crashes the training once, after the evaluation at `step`."""
 
     def __init__(self, root, step):
         self.root, self.step, self.happened = root, step, False
@@ -81,7 +81,7 @@ def test_tensorboard_shows_what_the_files_of_the_run_have(tmp_path, algo):
 def test_a_run_that_resumes_continues_the_same_page_without_a_step_twice(tmp_path):
     words = f"algo=SRad {WORDS} seed=3,5 log=tensorboard"
     with pytest.raises(ZeroDivisionError):
-        train(tmp_path, words, Crash(tmp_path, 50))  # its checkpoint is of step 30
+        train(tmp_path, words, Crash(tmp_path, 50))  # the newest checkpoint is of step 30
     train(tmp_path, words)
     for folder in find_runs(tmp_path):
         files = sorted((folder / "tensorboard").iterdir())
@@ -96,7 +96,7 @@ def test_a_run_that_resumes_continues_the_same_page_without_a_step_twice(tmp_pat
 
 
 def test_weights_and_biases_offline_keeps_one_run_over_resumptions(tmp_path):
-    """In a process of its own, as Weights & Biases starts others."""
+    """In a separate process, because Weights & Biases starts further ones."""
     code = f"""
 import sys, time
 sys.path.insert(0, {str(ROOT / "tests")!r})
@@ -119,7 +119,7 @@ except ZeroDivisionError:
     for folder in find_runs(tmp_path):
         name = (folder / "wandb-id.txt").read_text()
         files = sorted((folder / "wandb").glob(f"offline-run-*-{name}/run-{name}.wandb"))
-        assert len(files) == 2  # one a process, of the same run
+        assert len(files) == 2  # a file for each process, of the same run
         kept = b"".join(file.read_bytes() for file in files)
         for tag in ("evaluation/return", "training/suggested_violation", "result/return", "speed/steps_per_second"):
             assert tag.encode() in kept
@@ -127,7 +127,7 @@ except ZeroDivisionError:
             repr(read_run(folder).evaluations.return_mean[-1]).removeprefix("np.float64(").rstrip(")").encode() in kept
         )
         names.add(name)
-    assert len(names) == 2  # the seeds are runs of their own
+    assert len(names) == 2  # each seed is a run
 
 
 @pytest.mark.parametrize("name, module", [("tensorboard", "torch.utils.tensorboard"), ("wandb", "wandb")])
@@ -164,7 +164,7 @@ def test_an_unknown_logger_is_refused(tmp_path, capsys, value):
 
 
 class Failing:
-    """Opens, and then breaks at its `calls`-th call: 0 is opening, closing counts as well."""
+    """A logger that fails after `calls` successful calls. Opening, logging and closing count."""
 
     def __init__(self, calls):
         self.calls = calls
@@ -192,7 +192,7 @@ def test_a_logger_that_fails_is_named_once_and_the_training_goes_on(tmp_path, mo
     said = [line for line in capsys.readouterr().err.splitlines() if "log=wandb" in line]
     assert len(said) == 1 and f"{folder}: log=wandb ends after step" in said[0]
     assert "no space left on device (the training goes on" in said[0]
-    assert_shows_the_files(folder, "DRad")  # the other one as well
+    assert_shows_the_files(folder, "DRad")  # the other logger is complete
 
 
 def test_a_logger_that_fails_at_the_end_leaves_the_result(tmp_path, monkeypatch, capsys):

@@ -1,4 +1,4 @@
-"""Maps as objects, refused combinations, settings; a map and an off-policy algorithm of one's own."""
+"""Maps as objects, refused combinations, settings; a user's own map and off-policy algorithm."""
 
 import json
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ ALL_MAPS = (Project(), Alpha(), Radial(), Gauge(), Flow())
 
 
 class Soft(Map):
-    """a = c + v / (1 + L(v)), which no one else knows."""
+    """A user's own map: a = c + v / (1 + L(v))."""
 
     def __call__(self, constraint, obs, suggested, center):
         center = constraint.center(obs) if center is None else center
@@ -197,7 +197,8 @@ def test_what_is_accepted_is_what_the_table_has_and_no_more():
 
 @pytest.mark.parametrize("map", ALL_MAPS, ids=lambda map: type(map).__name__)
 def test_maps_stand_only_where_random_actions_and_suggestions_fit(map):
-    """Beyond "layer": pulling back is the map itself, feasible actions stay, and suggestions are in the box."""
+    """Pulling back twice changes nothing. A map that may stand elsewhere than in a layer pulls back by itself, and its
+    suggestions are in the box."""
     obs = torch.randn(200, OBS, generator=torch.Generator().manual_seed(4))
     action = 2 * torch.rand(200, DIM, generator=torch.Generator().manual_seed(5)) - 1
     pulled_back = map.pull_back(CONSTRAINT, obs, action, None)
@@ -206,7 +207,7 @@ def test_maps_stand_only_where_random_actions_and_suggestions_fit(map):
         assert map.squashes and torch.equal(map(CONSTRAINT, obs, action, None), pulled_back)
 
 
-# ---------------------------------------------------------------- a map and an algorithm of one's own
+# ---------------------------------------------------------------- a user's own map and algorithm
 
 
 @pytest.mark.parametrize("agent", [TD3, SAC])
@@ -221,7 +222,7 @@ def test_a_map_of_ones_own_is_one_class(agent, tmp_path, monkeypatch):
 
 
 def test_centres_are_computed_once_and_replayed(monkeypatch):
-    """No gradient step asks for a centre where the map says that it needs one."""
+    """If the map needs centres, they are stored, and no gradient step computes one."""
     calls = []
 
     def center(self, obs):
@@ -241,7 +242,7 @@ def test_centres_are_computed_once_and_replayed(monkeypatch):
         replay.add([0], Batch(obs[t], action.stored, zero, zero, obs[t + 1], now, then))
         now = then
         agent.update(batch := replay.sample(4))
-    assert agent.stores_centers and calls == [(1, OBS)] * (steps + 1)  # one an observation
+    assert agent.stores_centers and calls == [(1, OBS)] * (steps + 1)  # one call for each observation
     torch.testing.assert_close(batch.center, original(CONSTRAINT, batch.obs))
     torch.testing.assert_close(batch.next_center, original(CONSTRAINT, batch.next_obs))
     assert not Algorithm(TD3, Project(), "layer").map.replays_center(CONSTRAINT)
@@ -257,7 +258,7 @@ def test_the_settings_of_a_map_are_keys_of_its_algorithms(monkeypatch):
     config = config_of(["algo=Mine", "env=R+M", "scale=0.5"])
     assert (config.scale, config_of("algo=Mine env=R+M").scale) == (0.5, 1.0) and "scale" in setting_keys()
     assert ALGORITHMS["Mine"].build(config, CONSTRAINT, OBS, [0]).map == Scaled(0.5)
-    # A setting that only densities use is none of TD3's.
+    # TD3 does not have settings that only densities use.
     assert "entropy" not in keys_of(ALGORITHMS["DAlpha"].config_class)
     assert {"entropy", "boundary_weight"} <= keys_of(ALGORITHMS["SAlpha"].config_class).keys()
 
@@ -326,7 +327,7 @@ def test_saved_settings_come_back(name):
     assert saved["seed"] == "5" and saved["train_freq"] == "20" and "results" not in saved
     config.seeds = (5,)
     assert saved_config(saved) == config
-    # Older run folders have keys without a value, of settings that the algorithm does not have.
+    # Older run folders have keys with None for settings that the algorithm does not have.
     assert saved_config({"fw_learning_rate": None, "gsde": None, "penalty": None} | saved) == config
 
 
@@ -396,5 +397,5 @@ def test_an_off_policy_algorithm_of_ones_own_is_one_class_and_one_row(map, tmp_p
     results = [json.loads(path.read_text()) for path in tmp_path.glob("*/*/seed=*/result.json")]
     assert len(results) == 2 and all(result["gradient_steps"] == 59 for result in results)
     assert all(result["largest_violation"] <= 1e-6 for result in results)
-    # The table of hyperparameters gets a column of its own.
+    # The algorithm has its own column in the table of hyperparameters.
     assert ("Others", "DDPG") in {(r["robot"], r["base"]) for r in hyperparameter_table().records}

@@ -1,4 +1,4 @@
-"""What a command prints may get lost: its work and its exit code do not depend on it."""
+"""A command's output may get lost: its work and its exit code do not depend on it."""
 
 import io
 import os
@@ -78,7 +78,7 @@ def test_a_shell_that_does_not_listen(tmp_path, end):
     assert done.returncode == 0 and not done.stderr
     (folder,) = find_runs(tmp_path)
     assert read_run(folder).finished
-    assert not any(b"step/s" in path.read_bytes() for path in folder.iterdir())  # the bar is in none of its files
+    assert not any(b"step/s" in path.read_bytes() for path in folder.iterdir())  # no file has the progress bar
 
 
 def test_ctrl_c_that_ends_the_reader_first_leaves_a_checkpoint(tmp_path):
@@ -88,7 +88,7 @@ def test_ctrl_c_that_ends_the_reader_first_leaves_a_checkpoint(tmp_path):
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        # Whoever runs the tests in the background may have them ignore the signal, and children inherit that.
+        # A shell that runs the tests in the background may ignore the signal, and child processes inherit that.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 120

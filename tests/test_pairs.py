@@ -14,7 +14,8 @@ SHORT = ["learning_starts=20", "batch_size=8", "hidden=[16,16]", "eval_episodes=
 
 
 def settings(algo, task):
-    """A short run with gradient steps: where TD3 waits for the end of an episode, one that ends soon or none."""
+    """Settings of a short run with gradient steps. If TD3 waits for the end of an episode, the run has a short one or
+    changes `train_freq`."""
     robot = TASKS[task].robot.__name__
     if algo == "ARAM":
         return {"steps": 40, "snapshots_after": 0, "snapshot_every": 5}
@@ -51,7 +52,7 @@ def test_pair(tmp_path, capsys, monkeypatch, algo, task):
     last = torch.load(folder / "last.pt", weights_only=True)
     assert all(parameter.isfinite().all() for parameter in last.values())
     assert last.keys() == fresh.keys()
-    modules = {name.split(".")[0] for name in last} - {"map"}  # which nothing trains any more
+    modules = {name.split(".")[0] for name in last} - {"map"}  # which is not trained any more
     assert {"actor", "critic", "critic_target"} <= modules and ("actor_target" in modules) == (
         ALGORITHMS[algo].agent.family == "TD3"
     )

@@ -190,7 +190,7 @@ def test_what_is_no_policy_is_refused(finished, tmp_path):
 
 
 def frames_of(path):
-    """The video as an array (k, h, w, 3), and its pictures a second."""
+    """The video as an array (k, h, w, 3), and its frames a second."""
     reader = imageio_ffmpeg.read_frames(str(path))
     meta = next(reader)
     width, height = meta["size"]

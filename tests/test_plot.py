@@ -251,7 +251,7 @@ def test_description_names_a_module_of_the_project_that_the_commit_does_not_have
     git("add", "run.py", "provenance.py", "constraints/ball.py")
     for module in (provenance, origin):
         monkeypatch.setattr(module, "ROOT", tmp_path)
-    monkeypatch.setattr(origin, "_commands", set)  # a cached function, which keeps what it has seen
+    monkeypatch.setattr(origin, "_commands", set)  # the real function is cached, so it would keep old results
     monkeypatch.setattr(provenance, "__file__", str(tmp_path / "provenance.py"))
     for name in ("ball", "mine"):
         module = types.ModuleType(f"constraints.{name}")
@@ -305,7 +305,7 @@ def test_best_of_a_row():
     assert rewards.best_of_row({"a": 1.0, "b": 4.0, "c": 3.0, "d": 2.0}) == {"b", "c", "d"}
     assert rewards.best_of_row({"a": -1.0, "b": -4.0, "c": -3.0, "d": -2.0}) == {"a", "d", "c"}
     assert rewards.best_of_row({"a": 1.0, "b": 4.0, "c": 3.0, "d": 1.0}) == {"a", "b", "c", "d"}  # tied third
-    # All of three would be among the best three.
+    # With three names, all would be among the best three.
     assert rewards.best_of_row({"a": 1.0, "b": 4.0, "c": 3.0}) == {"b"}
     assert rewards.best_of_row({"a": 1.0, "b": 1.0}) == {"a", "b"}
     assert rewards.best_of_row({"a": 1.0}) == {"a"}
@@ -330,7 +330,7 @@ def test_the_papers_table_is_typed_right():
 
 @pytest.fixture(scope="module")
 def mixed(tmp_path_factory):
-    """Results as they look in the middle of the work, already plotted; the folder and what was printed."""
+    """The folder of an unfinished benchmark's results after plotting, and the printed output."""
     root = tmp_path_factory.mktemp("results")
     for seed in range(10):
         write_run(root, "R+L2", "DPro", seed, result=-5.0 + 0.1 * seed)
@@ -373,7 +373,7 @@ def test_markdown(mixed):
     root, _ = mixed
     text = (root / "tables" / "rewards.md").read_text()
     rows = [[cell.strip() for cell in line.strip("|\n").split("|")] for line in text.splitlines() if "|" in line]
-    # Only algorithms with results have a column, and those that are the same as one of them without a constraint.
+    # Columns are for algorithms with results, and for those that coincide with one of them without a constraint.
     same = [algo for algo in paper.COLORS if paper.SAME_WITHOUT_CONSTRAINT.get(algo) == "DPro"]
     used = [algo for algo in paper.COLORS if algo in ("DPro", "NFW", "DRad", "SRad", *same)]
     assert rows[0] == ["Condition", *used, "Mine"]
@@ -493,7 +493,7 @@ def test_an_override_and_an_older_default_keep_rows_of_their_own(tmp_path):
 
 
 def test_a_setting_that_came_later_divides_only_who_has_it(tmp_path):
-    """Runs older than a setting lack its key; algorithms without it have None. 1 and 1.0 are told apart, and named."""
+    """Runs older than a setting lack its key; algorithms without it have None. Labels distinguish 1 and 1.0."""
     write_run(tmp_path, "R+N", "DRad", 0, result=10.0)
     write_run(tmp_path, "R+N", "DRad", 1, result=10.0, entropy=None)
     write_run(tmp_path, "R+N", "SRad", 0, result=10.0)
@@ -538,7 +538,7 @@ def test_one_run_in_progress_is_enough(tmp_path, capsys):
 
 
 def test_a_run_is_plotted_while_it_writes(tmp_path):
-    """Every moment between two writes, and one within a write, leaves something that can be plotted."""
+    """A run can be plotted at every moment between two writes, and at one moment within a write."""
     writer = write_run(tmp_path, "R+L2", "SPre", 0, evaluations=0)
     assert plot.main([str(tmp_path), "format=png"]) == 0
     for step in (5_000, 10_000):

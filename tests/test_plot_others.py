@@ -1,4 +1,4 @@
-"""Several folders of results side by side, published runs among them, and CSV files that anybody can write."""
+"""Several folders of results side by side, including published runs, and CSV files of other programs."""
 
 import csv
 from pathlib import Path
@@ -116,7 +116,7 @@ def test_folders_stand_side_by_side(tmp_path, ours, drawn):
     colors = [line.get_color() for line in drawn["R+L2"].axes[0].lines]
     assert len(set(colors)) == 3
     assert labels(drawn["R+L2,gamma=0.5"]) == ["SRad (fork)"]
-    # The paper's number stands beside both.
+    # Both are compared with the paper's number.
     compared = {r["algo"]: r["paper_mean"] for r in records(ours, "comparison") if not r["settings"]}
     assert float(compared["SRad"]) == float(compared["SRad (fork)"]) == read_paper()["R+L2", "default", "SRad"].mean
     assert compared["Mine"] == ""
@@ -172,7 +172,7 @@ def test_a_csv_file_stands_beside_a_folder(tmp_path, ours, drawn, as_folder):
     assert labels(drawn["R+L2"]) == ["SRad", "SRad (theirs)", "FISOR (theirs)", "Mine"]
     line = drawn["R+L2"].axes[0].lines[1]
     assert line.get_xdata().tolist() == [5_000, 10_000] and line.get_ydata().tolist() == [3.75, 8.5]
-    assert {r["algo"] for r in records(ours, "adjusted")} == {"SRad", "Mine"}  # the starts of the others are not known
+    assert {r["algo"] for r in records(ours, "adjusted")} == {"SRad", "Mine"}  # the other runs' starts are not known
 
 
 def test_a_csv_file_alone(tmp_path, drawn):
@@ -225,7 +225,7 @@ def test_files_that_are_none(tmp_path, ours, capsys):
     assert "no column task, algorithm" in refused_by_plot(capsys, theirs(tmp_path, "", "empty.csv"))
     (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00\x01")
     assert "binary.csv: " in refused_by_plot(capsys, tmp_path / "binary.csv")
-    # In a folder with runs, such a file is named and left out.
+    # In a folder with runs, such a file is reported and left out.
     theirs(ours, THEIRS.replace("algorithm", "algo"), "notes.csv")
     assert plot.main([str(ours), "format=csv"]) == 0
     assert f"skipped {ours / 'notes.csv'}: no column algorithm" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Tables and figures of algorithms of one's own, of settings side by side, and of seeds that diverged."""
+"""Tables and figures of a user's own algorithms, of several settings, and of diverged seeds."""
 
 import csv
 import math
@@ -20,7 +20,7 @@ def records(root, table):
 
 
 def failed_run(root, task, algo, seed, result):
-    """A run that diverged; `result` as the trainer leaves it."""
+    """Write a run that diverged; `result` has the form that the trainer writes."""
     writer = write_run(root, task, algo, seed, evaluations=2)
     writer.fail({"step": 12_345, "quantity": "critic loss is not finite", "result": result})
     return writer
@@ -130,14 +130,14 @@ def test_settings_of_all_rows_are_in_the_title_and_other_rows_stand_below(tmp_pa
     for name in ("rewards", "comparison", "adjusted", "aggregate", "improvement"):
         for suffix in ("md", "tex"):
             head, *body = (tmp_path / "tables" / f"{name}.{suffix}").read_text().splitlines()
-            # Only a reader with the title knows these settings.
+            # Only the title has these settings.
             assert head.endswith(said) and "steps" not in "".join(body), (name, suffix)
     full = {record["settings"] for record in records(tmp_path, "rewards")}
     plain = "hidden=[32,32], steps=1500"
     assert full == {plain, f"distance=1.0, {plain}", f"{plain}, tau=0.1"}
     settings = [record["settings"] for record in records(tmp_path, "aggregate")]
     assert list(dict.fromkeys(settings)) == [plain, f"{plain}, tau=0.1", f"distance=1.0, {plain}"]
-    # A row with the paper's settings shares none, so every row keeps its own.
+    # With a row of the paper's settings, no setting is shared, so every row names its own.
     write_run(tmp_path, "R+N", "SRad", 0, result=15.0)
     table = reward_table(group_runs(read_results(tmp_path)[0])[0])
     assert "all runs with" not in table.title and table.sections[0][0][0].lines == ("R+N",)
@@ -150,7 +150,7 @@ def test_settings_of_one_algorithm_stand_in_one_figure_with_the_default(tmp_path
         writer = write_run(tmp_path, "R+L2", "DPre", 0, overrides=overrides, **config)
         writer.append_statistics(10_000, {"critic_loss": 0.5, "actor_loss": -1.0, "mean_q": 2.0})
         write_run(tmp_path, "R+L2", "Mine", 0, overrides=overrides, **config)  # has no training measures
-    write_run(tmp_path, "R+L2", "Other", 0, learning_rate=1e-3)  # nor has this, and only one setting
+    write_run(tmp_path, "R+L2", "Other", 0, learning_rate=1e-3)  # no measures either, and only one setting
     assert plot.main([str(tmp_path)]) == 0
     figure = drawn["R+L2-training"]
     labels = [text.get_text() for text in figure.legends[0].get_texts()]

@@ -40,7 +40,7 @@ def test_interquartile_mean(two):
 
 
 def test_the_bootstrap_is_stratified(two):
-    """Tasks that differ widely, with runs that do not, leave nothing to be uncertain about."""
+    """If tasks differ widely but the runs of a task do not, the interval is a single point."""
     scores = {task: np.full(5, float(level)) for level, task in enumerate(two[0])}
     estimate = statistics.interquartile_mean(scores)
     assert estimate.low == estimate.high == estimate.value == pytest.approx(1.0)
@@ -89,7 +89,7 @@ def test_scores_are_normalised_by_the_best_cell_of_the_papers_row(tmp_path):
     write_cell(tmp_path, "R+L2", "SRad", [19.70, 0.0])
     write_cell(tmp_path, "HC+O", "SRad", [9973, -9973], overrides={"batch_size": 16})
     write_cell(tmp_path, "R+CBF", "SRad", [1.0, 2.0])
-    write_cell(tmp_path, "R+M", "SRad", [1.0])  # a single run says nothing of the spread
+    write_cell(tmp_path, "R+M", "SRad", [1.0])  # a single run has no spread
     write_run(tmp_path, "R+L2", "SRad", 7)  # unfinished
     scores = scores_of(tmp_path)
     assert {settings: {a: list(t) for a, t in s.items()} for settings, s in scores.items()} == {

@@ -1,4 +1,4 @@
-"""Files of one's own by `plugin=`, and the tables that they write into."""
+"""User files loaded by `plugin=`, and the tables to which they add entries."""
 
 import json
 import os
@@ -72,7 +72,7 @@ def test_a_plugin_may_be_named_through_a_link(plugin, tmp_path):
         file.rename(tmp_path / "real" / file.name)
     (tmp_path / "link").symlink_to("real")
     show = "import sys; from sweep.plugins import load_plugins; load_plugins(sys.argv[1:]); import mine; print(mine)"
-    path = os.pathsep.join([str(tmp_path / "real"), str(ROOT)])  # as a shell in that folder finds it
+    path = os.pathsep.join([str(tmp_path / "real"), str(ROOT)])  # the real path, as in a shell there
     done = python("-c", show, f"plugin={tmp_path / 'link' / 'mine.py'}", env=os.environ | {"PYTHONPATH": path})
     assert done.returncode == 0 and "mine.py" in done.stdout, done.stderr
 
@@ -89,7 +89,7 @@ def test_the_processes_of_a_sweep_load_them(plugin, tmp_path):
 
 
 def test_a_pickled_cell_brings_its_plugins(plugin, tmp_path):
-    """As submitit's jobs do."""
+    """A job of submitit is pickled like this."""
     make = (
         "import pickle, sys; from sweep.plugins import load_plugins; from sweep.cells import make_cells;"
         "from core.words import parse_words; from algos import setting_keys;"

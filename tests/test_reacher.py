@@ -14,7 +14,7 @@ from envs.reacher import ARRAYS, FLOATS, MANY, Reacher, State, advance
 
 DATA = Path(__file__).parent / "data"
 SAME_BITS = platform.machine() == "x86_64" and platform.libc_ver()[0] == "glibc"
-"""Whether this machine's sine, cosine and sums round as those of the machine that made the recordings."""
+"""Whether sine, cosine and sums round on this machine as on the machine that made the recordings."""
 
 
 @pytest.fixture(params=["closed-form", "pybullet"])
@@ -75,7 +75,7 @@ def test_single_steps_equal_recorded_ones_of_pybullet():
 
 def test_episodes_that_spin_and_hit_the_limit_equal_recorded_ones_of_pybullet():
     recorded = np.load(DATA / "transitions.npz")
-    steps = 150 if SAME_BITS else 20  # elsewhere the last bit differs, and grows
+    steps = 150 if SAME_BITS else 20  # elsewhere the last bit differs, and the difference grows
     limited = 0
     for actions, q, w in zip(*(recorded[f"episode_{name}"] for name in ("actions", "q", "qd")), strict=True):
         state = (*q[0].tolist(), *w[0].tolist())
@@ -219,7 +219,7 @@ def test_a_state_of_another_simulator_is_refused(bullet):
 
 @pytest.mark.parametrize("stateless", [False, True])
 def test_pybullet_goes_on_from_its_state_and_by_repeating_actions(bullet, stateless, monkeypatch):
-    """A robot without a state of its own is resumed by its actions, as PyBullet was in earlier checkpoints."""
+    """A robot that returns no state is restored by repeating its actions, as PyBullet was in earlier checkpoints."""
     if stateless:
         monkeypatch.setattr(PyBulletReacher, "get_state", lambda self: None)
     env, other = (envs.make("R+N", simulator="pybullet") for _ in range(2))
@@ -254,7 +254,7 @@ def test_close_frees_the_physics_client(bullet):
 
 
 def pixel(x, y):
-    """Row and column of a place in the arena."""
+    """Row and column of a point in the arena."""
     return round(240 - y / 0.33 * 240), round(240 + x / 0.33 * 240)
 
 
@@ -291,7 +291,7 @@ def test_a_picture_shows_the_feasible_set_and_the_action_where_asked(task):
     dots = [(picture == (200, 60, 20)).all(-1).sum() for picture in (before, env.render())]
     assert dots[0] == 0 and dots[1] > 20
     green = (before == (196, 230, 200)).all(-1), (env.render() == (196, 230, 200)).all(-1)
-    assert (green[0] >= green[1]).all()  # the set of the action drawn in it, not the next one's
+    assert (green[0] >= green[1]).all()  # the set belongs to the drawn action, not to the next one
     np.testing.assert_array_equal(env.render()[:, :300], plain.render()[:, :300])
 
 

@@ -8,7 +8,7 @@ from core.replay import Batch, Replay
 
 
 def numbered(seeds, number, centers=True):
-    """Transition `number`: seed i's obs is 100 i + number, and every other column tells the same number."""
+    """Transition `number`: seed i's obs is 100 i + number, and every other column is derived from the same value."""
     value = torch.arange(seeds).unsqueeze(1) * 100.0 + number
     columns = [torch.cat([value, -value], 1), value + 0.1, value + 0.2, value % 2, torch.cat([value + 0.3] * 2, 1)]
     return Batch(*columns, *([value + 0.4, value + 0.5] if centers else []))
@@ -72,7 +72,7 @@ def test_a_seed_samples_the_same_alone_and_among_others():
 @pytest.mark.parametrize("draw", ["normal", "uniform"])
 def test_streams_draw_what_each_seed_alone_would(draw):
     together, lone = Streams([1, 3, 8], "explore"), Streams([3], "explore")
-    # While seed 3 draws three times, its neighbours draw at times of their own.
+    # Seed 3 draws three times; its neighbours draw at other times.
     for only in ([0, 1, 2], [1], [1, 2]):
         drawn = getattr(together, draw)(4, 2, which=only)
         assert torch.equal(drawn[1], getattr(lone, draw)(4, 2)[0])
@@ -80,7 +80,7 @@ def test_streams_draw_what_each_seed_alone_would(draw):
             assert not drawn[i].any()
     first = Streams([1], "explore")
     getattr(first, draw)(4, 2)
-    # Seed 1 sat out twice: its stream stands where it stood after its only draw.
+    # Seed 1 has skipped two draws: its stream is where it was after its only draw.
     assert torch.equal(getattr(together, draw)(4, 2)[0], getattr(first, draw)(4, 2)[0])
 
 
@@ -116,7 +116,7 @@ def test_transitions_on_their_way_are_in_the_buffer_whenever_it_is_read():
 
 
 def test_the_device_knows_how_much_it_can_sample():
-    """Also after a checkpoint was restored, which writes transitions and their number directly."""
+    """Also after restoring a checkpoint, which writes transitions and their number directly."""
     replay = filled([4, 7], [3, 8], capacity=5)
     replay.flush()
     assert replay.sizes.tolist() == [[3], [5]]

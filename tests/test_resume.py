@@ -1,4 +1,4 @@
-"""A run that is interrupted, killed or damaged and taken up again ends with every bit of the run that never was."""
+"""A run that is interrupted, killed or damaged and then resumed ends with the same bits as an unbroken run."""
 
 import multiprocessing
 import random
@@ -27,7 +27,7 @@ def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path,
     words = f"{words} seed=3,5 {SETTINGS}"
     whole = Breaks()
     train(tmp_path / "whole", words, whole)
-    # In the warm-up, amid episodes, between gradient steps, in evaluations.
+    # Interrupts in the warm-up, within episodes, between gradient steps, and in evaluations.
     check = Breaks(*range(70, whole.calls, whole.calls // 5))
     assert train_through(tmp_path / "broken", words, check) in (4, 5)
     assert_identical(outcome(tmp_path / "whole"), outcome(tmp_path / "broken"))
@@ -38,9 +38,9 @@ def test_interrupted_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path,
 
 
 def kill_through(root, words, kills, rng):
-    """Start the command and kill it at a random moment, `kills` times, then let it end; the seconds of the last start.
+    """Start the command and kill it at a random moment, `kills` times, then let it end. Returns the last run's seconds.
 
-    The processes are forks of one that has imported everything, so that most kills meet the training.
+    The processes are forked from one that has imported everything, so that most kills hit the training.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["sweep.train"])
@@ -61,7 +61,7 @@ def kill_through(root, words, kills, rng):
 def test_killed_anywhere_it_ends_with_the_bits_of_an_unbroken_run(tmp_path, checkpoint_every):
     words = f"algo=DAlpha env=W+M seed=3,5 {SETTINGS}"
     train(tmp_path / "whole", words)
-    # With a checkpoint after every step, most kills meet the writing of one, often between the two seeds' files.
+    # With a checkpoint after every step, most kills hit the writing of one, often between the two seeds' files.
     kill_through(
         tmp_path / "broken", f"{words} checkpoint_every={checkpoint_every}", 6, random.Random(checkpoint_every)
     )

@@ -29,7 +29,7 @@ def by_rejection(constraint, obs, count, seed=1):
 
 
 def assert_same_distribution(points, reference):
-    """A Kolmogorov-Smirnov test a coordinate and of two functions of all, first and second moments."""
+    """Kolmogorov-Smirnov tests of each coordinate and of two functions of all coordinates; first and second moments."""
     for measure in (*range(points.shape[-1]), "largest", "sum"):
         one, other = (
             {"largest": x.abs().amax(-1), "sum": x.sum(-1)}[measure] if isinstance(measure, str) else x[:, measure]
@@ -81,7 +81,7 @@ def test_thin_sets_are_as_good_as_round_ones(aspect):
     reference = by_rejection(diamond, torch.ones(2, dtype=torch.float64), COUNT)
     assert_same_distribution(points, reference)
 
-    aspect = min(aspect, 1e4)  # the oracle of general ellipses goes no further
+    aspect = min(aspect, 1e4)  # the limit of the oracle for general ellipses
     turn = torch.tensor([[0.6, -0.8], [0.8, 0.6]], dtype=torch.float64)
     Q = turn @ torch.diag(torch.tensor([4.0 * aspect**2, 4.0], dtype=torch.float64)) @ turn.T
     ellipse = QuadraticConstraint(2, lambda obs: Q, 1.0)
@@ -149,7 +149,7 @@ def test_a_flat_set_is_sampled_within_its_tolerance(rows, bounds):
     constraint = LinearConstraint(rows.shape[1], lambda obs: rows, lambda obs: bounds, on_empty="least")
     points = constraint.sample(torch.zeros(1, dtype=torch.float64), 400, generator())
     assert points.isfinite().all() and (points[..., 0] - bounds[0]).abs().max() <= 1e-6
-    if rows.shape[1] == 2:  # all along the other axis
+    if rows.shape[1] == 2:  # uniform along the other axis
         assert points[..., 1].std() == pytest.approx(3**-0.5, abs=0.05)
 
 

@@ -1,4 +1,4 @@
-"""The choice of a simulator on the command line, and checkpoints of another version, as a user meets them."""
+"""The choice of a simulator on the command line, and checkpoints of another version, as a user sees them."""
 
 import hashlib
 import io
@@ -57,7 +57,7 @@ def test_pybullet_trains_as_the_closed_form_does(tmp_path):
     for simulator in ("closed-form", "pybullet"):
         words = f"algo=DPre env=R+L2,H+M steps=30 {SHORT} simulator={simulator} results={tmp_path / simulator}"
         assert run(words).returncode == 0
-        for task, expected in (("R+L2", simulator), ("H+M", None)):  # a key goes to the tasks that have it
+        for task, expected in (("R+L2", simulator), ("H+M", None)):  # a key applies to tasks that have it
             (folder,) = (tmp_path / simulator / task).glob("*/seed=0")
             assert yaml.safe_load((folder / "config.yaml").read_text())["simulator"] == expected
             assert "simulator" not in folder.parent.name
@@ -67,7 +67,7 @@ def test_pybullet_trains_as_the_closed_form_does(tmp_path):
 
 
 def interrupt(words, root):
-    """Start the command, and end it with SIGTERM when it has a checkpoint; the files of its state."""
+    """Start the command, and end it with SIGTERM when it has a checkpoint. Returns the files of its state."""
     process = subprocess.Popen([sys.executable, "run.py", *words.split()], cwd=ROOT, stderr=subprocess.DEVNULL)
     while not list(root.glob("R+N/*/seed=0/checkpoint/state-*.pt")):
         assert process.poll() is None
@@ -78,7 +78,7 @@ def interrupt(words, root):
 
 
 def make_old(states):
-    """Take the number of the format out of these files, as files had none at first."""
+    """Remove the format number from these files. Files of the first version have none."""
     for path in states:
         content = torch.load(io.BytesIO(path.read_bytes().partition(b"\n")[2]), weights_only=True)
         del content["format"]
@@ -147,7 +147,7 @@ class SlowCheetah(HalfCheetah):
 
 
 def test_a_class_that_derives_from_a_robot_runs_itself(tmp_path, monkeypatch):
-    """Its base class's choice of simulators names the base class."""
+    """The choice of simulators that it inherits names only its base class."""
     monkeypatch.setitem(TASKS, "R+Slow", Task(SlowArm, Ball(0.05, 2), "", "", 40))
     assert isinstance(envs.make("R+Slow").robot, SlowArm)
     words = "algo=DPre env=R+Slow steps=40 learning_starts=30 batch_size=4 hidden=[4] eval_every=20 eval_episodes=1"
@@ -158,7 +158,7 @@ def test_a_class_that_derives_from_a_robot_runs_itself(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("robot", [SlowArm, SlowCheetah])
 def test_a_step_that_a_derived_class_changes_is_also_taken_together(robot):
-    """Where the base class has a faster way for many, too."""
+    """Even if the base class has a faster method for many robots."""
     robots = [robot() for _ in range(MANY)]
     for number, each in enumerate(robots):
         each.reset(np.random.default_rng(number))

@@ -1,6 +1,6 @@
-"""Sweeps on a real Slurm of one node: time limits, signals, kills, requeues, and what comes out in the end.
+"""Sweeps on a real Slurm of one node: time limits, signals, kills, requeues, and the final results.
 
-`tests/slurm/single_node.sh start` brings one up; `.ci/run` does.
+`tests/slurm/single_node.sh start` starts such a Slurm; `.ci/run` calls it.
 """
 
 import json
@@ -32,7 +32,7 @@ WORDS = (
 # Slurm looks at time limits twice a minute, and may send the signal half a minute early.
 SLURM = "launcher=slurm slurm.hours=0.033 slurm.signal=USR2@30 slurm.comment=a_test"
 PATIENCE = 900.0
-"""Seconds until the test gives up; on two cores it takes some 160, on busy ones twice as long."""
+"""Seconds until the test gives up. On two cores it takes about 160 seconds, on busy ones twice as long."""
 
 
 def reason_to_skip():
@@ -49,7 +49,7 @@ def reason_to_skip():
 
 @pytest.fixture
 def slurm():
-    """Skips where there is no Slurm, and leaves no jobs behind."""
+    """Skips the test without Slurm, and leaves no jobs behind."""
     pytest.importorskip("submitit", reason="submitit is not installed")
     if reason := reason_to_skip():
         pytest.skip(reason)
@@ -60,7 +60,7 @@ def slurm():
 
 
 def submit(root, jobs, algos=ALGOS):
-    """Give the command once more, as from a shell; how many jobs it submitted."""
+    """Run the command again, as from a shell. Returns the number of jobs that it submitted."""
     command = [sys.executable, "run.py", f"algo={algos}", *WORDS.split(), *SLURM.split(), f"results={root}"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
@@ -88,11 +88,11 @@ def birth_of(pid):
 
 
 class Fault:
-    """Something that happens to a cell's job between a tenth and half of its steps.
+    """A fault that hits a cell's job between a tenth and half of its steps.
 
-    The process is stopped before it is struck, and goes on once the signals of `awaited` wait for it: however fast the
-    job is and however slow Slurm, it is struck at that point, with whole checkpoints before it. A run that was over
-    before it could be stopped is deleted and submitted again.
+    The process is stopped before the fault, and continues once the signals of `awaited` are pending. So the fault hits
+    at that point, after complete checkpoints, however fast the job and however slow Slurm is. A run that ended before
+    it could be stopped is deleted and submitted again.
     """
 
     awaited = ()
@@ -109,7 +109,7 @@ class Fault:
         return self.job in queue([self.job])
 
     def owner(self):
-        """The number of the process that trains the cell, from its lock; None where there is none."""
+        """The id of the process that trains the cell, from its lock; None if there is none."""
         lock = self.cell.folders[0].with_name("seed=3.lock")
         try:
             return json.loads(lock.read_text())["pid"]
@@ -120,7 +120,7 @@ class Fault:
         return submit(self.root, self.jobs, self.cell.variant.partition(",")[0])
 
     def send(self, *signals):
-        # Not waited for: scancel repeats for a minute what it has sent to a job of an array.
+        # Do not wait: scancel repeats a signal to a job of an array for a minute.
         self.senders = [
             subprocess.Popen(["scancel", f"--signal={name}", self.job], stderr=subprocess.DEVNULL) for name in signals
         ]
@@ -136,22 +136,22 @@ class Fault:
                 for sender in self.senders:
                     sender.kill()
                     sender.wait()
-                os.kill(self.struck, signal.SIGCONT)  # not every Slurm does that itself
+                os.kill(self.struck, signal.SIGCONT)  # not every Slurm sends SIGCONT itself
             if self.follow_up():
                 self.stage = 2
 
     def is_gone(self):
-        """Whether the struck process has ended. Another one may have its number by now."""
+        """Whether the struck process has ended. Another process may have its id by now."""
         return birth_of(self.struck) != self.born
 
     def is_in_reach(self):
         return STEPS // 10 <= saved_step(self.cell.folders[0]) <= STEPS // 2
 
     def holds(self):
-        """Stop the cell's process. Whether it stands still where it is to be struck."""
+        """Stop the cell's process. Returns whether it has stopped in the range of steps where the fault may hit."""
         folder, pid = self.cell.folders[0], self.owner()
         if is_finished(folder):
-            if not self.is_queued():  # over before a look at it: once more
+            if not self.is_queued():  # it ended before it was stopped: start again
                 for folder in self.cell.folders:
                     shutil.rmtree(folder)
                 assert self.submit() == 1
@@ -170,10 +170,10 @@ class Fault:
 
 
 class Requeued(Fault):
-    """Cancelled, which must not bring it back, and then put back into the queue by its owner."""
+    """The job is cancelled, after which it must not requeue itself, and then requeued by its owner."""
 
     def strike(self):
-        # Slurm lets a cancelled process go on, to end it by SIGTERM a moment later. Here it finds one waiting.
+        # Slurm continues a cancelled process and ends it by SIGTERM a moment later. Here SIGTERM is pending already.
         os.kill(self.struck, signal.SIGTERM)
         self.send("KILL")
 
@@ -185,7 +185,7 @@ class Requeued(Fault):
 
 
 class Resubmitted(Fault):
-    """Killed without warning, and found by the next command to be neither finished nor queued."""
+    """The job is killed without warning. The next command finds it neither finished nor queued."""
 
     def strike(self):
         os.kill(self.struck, signal.SIGKILL)
@@ -195,7 +195,7 @@ class Resubmitted(Fault):
 
 
 class Preempted(Fault):
-    """Told that its node is wanted: by SIGTERM, and by the signal that it has asked for."""
+    """The job is told that its node is wanted, by SIGTERM and by the signal that it has requested."""
 
     awaited = (signal.SIGTERM, signal.SIGUSR2)
 
@@ -207,7 +207,7 @@ class Preempted(Fault):
 
 
 class OutOfTime(Fault):
-    """Held up until Slurm says that its time is almost over: it has a checkpoint to write."""
+    """The job is stopped until Slurm signals that its time is almost over. It must then write a checkpoint."""
 
     awaited = (signal.SIGUSR2,)
 

@@ -20,7 +20,7 @@ WORDS = (
 
 @pytest.fixture
 def trained(tmp_path, monkeypatch):
-    """Short runs, and the observations (seeds, episodes, 9) that their final episodes began with."""
+    """Short runs, and the first observations (seeds, episodes, 9) of their final episodes."""
     together, starts = Evaluator._together, []
 
     def recorded(self, policy, which, count):
@@ -78,7 +78,7 @@ def test_gain_is_what_the_arm_can_make_up():
     robot, rng = Reacher(), np.random.default_rng(0)
     obs = np.array([robot.reset(rng) for _ in range(200)])
     target = np.linalg.norm(obs[:, :2], axis=-1)
-    rest = np.abs(target[:, None] - radii).min(-1)  # the closest that any posture comes
+    rest = np.abs(target[:, None] - radii).min(-1)  # the smallest distance of any posture
     assert np.allclose(gains(obs), 100 * (np.linalg.norm(obs[:, 2:4], axis=-1) - rest), atol=0.01)
 
 

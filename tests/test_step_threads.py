@@ -1,4 +1,4 @@
-"""Robots that are moved in threads do what they do in one, in every bit, and errors come through."""
+"""Robots stepped in several threads give the same bits as in one thread, and their errors are raised."""
 
 import multiprocessing
 import threading

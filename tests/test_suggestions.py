@@ -1,4 +1,4 @@
-"""The measures of an actor's suggestions in training.csv, beside what the agent has really suggested."""
+"""The measures of an actor's suggestions in training.csv, compared with the agent's actual suggestions."""
 
 import math
 
@@ -40,7 +40,7 @@ def test_the_measures_are_those_of_what_the_map_was_given(tmp_path, monkeypatch,
             seen[i].append((excess, changed))
         return action
 
-    monkeypatch.setattr("sweep.train.check_training", lambda *_: None)  # it acts as well
+    monkeypatch.setattr("sweep.train.check_training", lambda *_: None)  # the check calls `act` too
     monkeypatch.setattr(Agent, "act", recorded)
     train(tmp_path, f"algo={algo} {WORDS}")
     for i, folder in enumerate(find_runs(tmp_path)):
@@ -52,7 +52,7 @@ def test_the_measures_are_those_of_what_the_map_was_given(tmp_path, monkeypatch,
             assert len(steps) in (1, 2)
             assert training["suggested_violation"][row] == pytest.approx(excess.clamp(min=0).mean().item(), abs=1e-6)
             assert training["suggested_infeasible"][row] == (excess > 0).float().mean().item()
-            if algo != "DRad" and algo != "SRad":  # a projection changes the infeasible ones alone
+            if algo != "DRad" and algo != "SRad":  # a projection changes only infeasible ones
                 assert training["suggested_infeasible"][row] == sum(changed for _, changed in steps) / len(steps)
         assert training["suggested_infeasible"].max() > 0
 

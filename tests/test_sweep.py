@@ -1,4 +1,4 @@
-"""Sweeps: settings, plans, estimates, the queue on this machine, records, states, and what Slurm is told."""
+"""Sweeps: settings, plans, estimates, the queue on this machine, records, states, and the requests to Slurm."""
 
 import json
 import os
@@ -48,7 +48,7 @@ def start(words, root, **options):
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        # Whoever runs the tests in the background may have them ignore the signal, and children inherit that.
+        # A shell that runs the tests in the background may ignore the signal, and child processes inherit that.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         **options,
     )
@@ -222,7 +222,7 @@ def test_times_in_words():
 
 
 def after_a_run_of(steps, result, folder, words, root, before):
-    """Whether a finished run of so many gradient steps changes the estimate of another cell."""
+    """Whether a finished run of `steps` gradient steps changes the estimate of another cell."""
     (folder / "result.json").write_text(json.dumps(result | {"gradient_steps": steps}))
     return {e.cell.name: e.remaining for e in plan_of(words, root)}["DRad R+N"] != before["DRad R+N"]
 
@@ -291,7 +291,7 @@ def test_a_cell_that_fails_is_reported_and_the_others_are_carried_on(tmp_path):
     words = f"algo=DPre,SRad env=R+N seed=3,5 {SHORT} jobs=2"
     broken = next(e.cell for e in plan_of(words.replace(" jobs=2", ""), tmp_path) if e.cell.config.algo == "SRad")
     lock = broken.folders[1].with_name("seed=5.lock")
-    lock.mkdir(parents=True)  # in place of a file: the process of this cell cannot go on
+    lock.mkdir(parents=True)  # a folder in place of a file: this cell's process fails
     process = start(words, tmp_path)
     out, err = process.communicate(timeout=240)
     assert process.returncode == 4, err
@@ -376,7 +376,7 @@ def test_cells_that_others_have_are_left_out(tmp_path, monkeypatch, capsys):
 
 
 def fake(tmp_path, monkeypatch, **programs):
-    """Programs of Slurm that say what they are told, in front of the others."""
+    """Put shell scripts with the names of Slurm's programs first in PATH."""
     folder = tmp_path / "bin"
     folder.mkdir(exist_ok=True)
     for name, script in programs.items():
@@ -410,7 +410,7 @@ def test_states(tmp_path):
     info.touch()
     os.utime(info, ns=(0, end.stat().st_mtime_ns - 1))
     assert state_of(cell, {}).stage is Stage.FAILED
-    os.utime(info, ns=(0, end.stat().st_mtime_ns + 1))  # a run.py of its own, after that
+    os.utime(info, ns=(0, end.stat().st_mtime_ns + 1))  # a separate run.py has started since
     assert (state_of(cell, {}).stage, state_of(cell, {}).step) == (Stage.INTERRUPTED, 40)
     info.unlink()
     lock = cell.folders[0].with_name("seed=0.lock")
@@ -461,7 +461,7 @@ def test_status_of_what_is_no_folder_of_results(tmp_path, monkeypatch, capsys, w
     assert err.startswith("run.py: ") and err.count("\n") == 1
 
 
-# ---------------------------------------------------------------- Slurm, where there is none
+# ---------------------------------------------------------------- without a real Slurm
 
 
 def test_jobs_that_slurm_knows(tmp_path, monkeypatch):
@@ -481,15 +481,15 @@ def test_jobs_that_slurm_knows(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "squeue, here, taken",
     [
-        ("echo 7_1 RUNNING", {}, False),  # the job goes on elsewhere
+        ("echo 7_1 RUNNING", {}, False),  # the job still runs elsewhere
         ("echo 7_1 SUSPENDED", {}, False),
         ("echo 7_1 CANCELLED", {}, True),
-        ("echo 7_0 RUNNING", {}, True),  # its neighbour in the array does
-        ("", {"SLURM_CLUSTER_NAME": "small"}, False),  # we ask another cluster
+        ("echo 7_0 RUNNING", {}, True),  # only its neighbour in the array runs
+        ("", {"SLURM_CLUSTER_NAME": "small"}, False),  # this process asks another cluster
         ("", {"SLURM_CLUSTERS": "small"}, False),
-        ("exit 1", {}, False),  # nobody knows
-        ("exit 1", {"SLURM_ARRAY_TASK_ID": "1", "SLURM_RESTART_COUNT": "1"}, True),  # we are its next incarnation
-        ("exit 1", {"SLURM_ARRAY_TASK_ID": "1"}, False),  # we are a step of the same incarnation
+        ("exit 1", {}, False),  # squeue fails
+        ("exit 1", {"SLURM_ARRAY_TASK_ID": "1", "SLURM_RESTART_COUNT": "1"}, True),  # this is the job, requeued
+        ("exit 1", {"SLURM_ARRAY_TASK_ID": "1"}, False),  # this is the job, not requeued
         ("exit 1", {"SLURM_ARRAY_TASK_ID": "2", "SLURM_RESTART_COUNT": "1"}, False),
     ],
 )
@@ -548,7 +548,7 @@ def test_without_slurm_or_submitit_one_line_says_so(tmp_path, monkeypatch, capsy
 
 @pytest.fixture
 def cluster(tmp_path, monkeypatch):
-    """Slurm's programs in name: jobs are accepted, and never run."""
+    """Stand-ins for Slurm's programs: jobs are accepted, but never run."""
     pytest.importorskip("submitit")
     (tmp_path / "queue").write_text("")
     number = f'n=$(($(cat {tmp_path}/n 2>/dev/null || echo 40) + 1)); echo $n > {tmp_path}/n; cp "$1" {tmp_path}/$n.sh'
@@ -606,9 +606,9 @@ def test_a_job_of_another_cluster_is_not_taken_for_gone(cluster, monkeypatch, ca
     assert run_command([*words, "launcher=slurm"]) == 0
     (cell,) = find_cells_of(cluster)
     assert cell.read("job")["cluster"] == "big"
-    assert state_of(cell, job_states([cell])).stage is Stage.NEW  # it is over
+    assert state_of(cell, job_states([cell])).stage is Stage.NEW  # the job is over
     monkeypatch.setenv("SLURM_CLUSTER_NAME", "small")
-    (cluster / "queue").write_text("41 RUNNING\n")  # another job of that number
+    (cluster / "queue").write_text("41 RUNNING\n")  # another job with that number
     capsys.readouterr()
     assert run_command([*words, "launcher=slurm"]) == 0
     said = f"Slurm does not tell here of job 41 of cluster big; if that is over, delete {cell.record('job')}"
@@ -618,7 +618,7 @@ def test_a_job_of_another_cluster_is_not_taken_for_gone(cluster, monkeypatch, ca
     assert run_command(["status", str(cluster / "results")]) == 0
     out = capsys.readouterr().out
     assert "1 cell: 1 unknown" in out and said in out
-    cell.note_end(2, cluster / "log")  # the job itself has said that it is over
+    cell.note_end(2, cluster / "log")  # the job itself has recorded its end
     assert state_of(cell, job_states([cell])).stage is Stage.FAILED
     assert run_command([*words, "launcher=slurm", "slurm.clusters=huge"]) == 0
     assert cell.read("job")["cluster"] == "huge"
@@ -652,7 +652,8 @@ def test_what_sbatch_refuses_is_said_in_one_line(cluster, monkeypatch, capsys):
 
 @pytest.fixture
 def job(cluster, monkeypatch):
-    """A job of a cell, which `end(code, step)` lets train up to a checkpoint of that step and end."""
+    """A cell's job: `end(code, step)` trains it up to a checkpoint at `step`, ends it with `code`, and returns whether
+    it was requeued."""
     from sweep import slurm as module
 
     (cluster / "queue").write_text("41 RUNNING\n")
@@ -696,7 +697,7 @@ def test_a_job_requeues_itself_unless_it_was_cancelled(cluster, monkeypatch, job
         assert not job(TERM, 40)
     assert not job.cell.record("end").exists()
     once = f"[ -e {cluster}/asked ] && echo 41 COMPLETING || {{ touch {cluster}/asked; exit 1; }}"
-    fake(cluster, monkeypatch, squeue=once)  # does not answer at first
+    fake(cluster, monkeypatch, squeue=once)  # squeue does not answer at first
     assert not job(TERM, 50)
     fake(cluster, monkeypatch, squeue="exit 1")
     assert job(TERM, 60)

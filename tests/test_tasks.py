@@ -1,4 +1,4 @@
-"""Rows of `envs.TASKS`: what is refused, and how Gymnasium finds them; the edges of Gymnasium's interface."""
+"""Rows of `envs.TASKS`: bad rows, and how Gymnasium finds them; edge cases of Gymnasium's interface."""
 
 import inspect
 import json
@@ -27,7 +27,7 @@ ROW = {"robot": Reacher, "constraint": Ball(0.1, 2), "description": "a task", "f
 
 @pytest.fixture
 def table():
-    """`envs.TASKS`, from which what a test enters is taken out again."""
+    """`envs.TASKS`. Entries that a test adds are removed afterwards."""
     before = set(envs.TASKS)
     yield envs.TASKS
     for name in set(envs.TASKS) - before:
@@ -203,7 +203,7 @@ def test_after_the_end_of_an_episode_a_reset_is_needed(task):
 
 @pytest.mark.parametrize("dtype", [np.float32, "float32"])
 def test_observations_in_single_precision(dtype):
-    """The environment itself stays as it is: the same rewards and the same exact observations."""
+    """The environment itself does not change: the same rewards and the same exact observations."""
     env, exact = envs.make("W+O+S", project=True, dtype=dtype), envs.make("W+O+S", project=True)
     assert env.observation_space.dtype == np.float32
     rng = np.random.default_rng(0)
@@ -227,19 +227,19 @@ def test_observations_in_single_precision(dtype):
             envs.make("R+N", dtype=bad)
 
 
-# ---------------------------------------------------------------- what is where in an observation
+# ---------------------------------------------------------------- the entries of an observation
 
 
 def rows_of(robot):
     """The table in a robot's docstring: the indices of each row, and its words."""
-    text = re.sub(r"\n {6,}(?=[a-z])", " ", inspect.getdoc(robot))  # a row may go on in a second line
+    text = re.sub(r"\n {6,}(?=[a-z])", " ", inspect.getdoc(robot))  # a row may have a second line
     rows = re.findall(r"^ *(\d+)(?:-(\d+))? +(.*)$", text, re.MULTILINE)
     return [(range(int(first), int(last or first) + 1), words) for first, last, words in rows]
 
 
 @pytest.mark.parametrize("task", ["HC+O", "H+M", "W+M"])
 def test_the_table_of_an_observation_names_mujocos_joints(task):
-    """Each entry is moved alone in the simulator, by the name of the joint, and shows at its index alone."""
+    """Each joint is moved alone in the simulator, by its name, and changes only the entry at its index."""
     robot = envs.TASKS[task].robot()
     robot.reset(np.random.default_rng(0))
     joints = {

@@ -1,4 +1,4 @@
-"""How many threads a cell has where the command does not say."""
+"""The number of threads of a cell if the command does not set it."""
 
 import json
 import os

@@ -24,21 +24,21 @@ from store.interrupt import Interrupted
 from store.writer import RunWriter
 
 OBS, DIM = 3, 2
-LENGTHS = (5, 7)  # of every other episode; the shorter ones terminate, the longer ones are cut off
+LENGTHS = (5, 7)  # of episodes, in turns; the shorter ones terminate, the longer ones are truncated
 CONSTRAINT = WeightedPositivePart(lambda obs: obs[..., :DIM] + 1.0, 0.5, DIM)
 
 
 def step_together(envs, actions):
-    """Scripted environments check no action and step by themselves."""
+    """Step scripted environments one by one; they do not check actions."""
     return [env.step(action) for env, action in zip(envs, actions, strict=True)]
 
 
 class Scripted(gymnasium.Env):
-    """obs (step, episode, number of the environment) of the episode; the reward is the action's first coordinate."""
+    """The obs is (step, episode, number of the environment), the reward the action's first coordinate."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBS,), np.float64)
     made = 0
-    robot = SimpleNamespace(max_episode_steps=10)  # of which a progress bar asks this
+    robot = SimpleNamespace(max_episode_steps=10)  # a progress bar reads this
 
     def __init__(self, fail=None):
         self.fail = fail  # called before every step
@@ -78,7 +78,7 @@ class Scripted(gymnasium.Env):
 
 
 class Counter(Agent):
-    """Its one parameter a seed counts gradient steps; its policy's reward is the score of that number."""
+    """Its only parameter, one for each seed, counts gradient steps. Its policy earns the score of that number."""
 
     def __init__(self, config, seeds, scores=()):
         super().__init__(config, CONSTRAINT, OBS, seeds, map=Alpha(), placement="layer")
@@ -167,7 +167,7 @@ def test_evaluations_every_so_many_steps_and_at_the_end(tmp_path, steps, at):
 
 
 def scores_at(evaluations):
-    """Scores of the numbers of gradient steps: those given, 0.9 at numbers that no evaluation meets."""
+    """Scores by number of gradient steps: the given ones, and 0.9 at numbers without an evaluation."""
     return [evaluations.get(n, 0.9) for n in range(60)]
 
 
@@ -182,7 +182,7 @@ def scores_at(evaluations):
     ],
 )
 def test_the_result_is_that_of_the_best_parameters(tmp_path, scores, best_step):
-    # One gradient step after each of the steps 11, 12, ...: evaluations see 9, 29 and 39 of them.
+    # One gradient step after each of the steps 11, 12, ...: evaluations come after 9, 29 and 39 of them.
     counts = dict(zip((20, 40, 50), (9, 29, 39), strict=True))
     trainer = make_trainer(tmp_path, scores=scores_at(dict(zip(counts.values(), scores, strict=True))))
     (result,) = trainer.run()
@@ -274,7 +274,7 @@ def test_the_agent_hears_of_every_rollout(tmp_path, train_freq, starts):
 def test_the_agent_hears_of_every_episode_before_its_first_step(tmp_path, train_freq):
     trainer = make_trainer(tmp_path, seeds=(4, 6), train_freq=train_freq, gradient_steps=2)
     trainer.run()
-    for i in range(2):  # of training alone, in warm-up too
+    for i in range(2):  # only of training, warm-up included
         started = [(episode, t) for j, episode, t in trainer.agent.episodes if j == i]
         assert started == [(episode, 0) for episode in range(trainer.seeds[i].env.episode + 1)] and len(started) == 9
 
@@ -305,13 +305,13 @@ def test_stored_transitions(tmp_path, train_freq):
         wanted, t, episode = [], 0, 0
         for _ in range(50):
             over = t + 1 == LENGTHS[episode % 2]
-            # (a time limit is stored as no end)
+            # A time limit is not stored as an end.
             wanted.append([t, episode, env.number, over and episode % 2 == 0, t + 1, episode, env.number])
             t, episode = (0, episode + 1) if over else (t + 1, episode)
         assert torch.equal(torch.cat([obs, terminated, next_obs], -1), torch.tensor(wanted).float())
         assert torch.equal(action, torch.from_numpy(np.stack(env.executed)))
         assert torch.equal(reward[:, 0], action[:, 0])
-        # The centre of s' belongs to where the episode ended, not to where the next one starts.
+        # The centre of s' is that of the episode's last observation, not of the next episode's first one.
         torch.testing.assert_close(center, CONSTRAINT.center(obs), rtol=0, atol=1e-6)
         torch.testing.assert_close(next_center, CONSTRAINT.center(next_obs), rtol=0, atol=1e-6)
         assert not torch.equal(center[1:], next_center[:-1])
@@ -440,7 +440,7 @@ def test_an_interrupt_while_the_best_parameters_are_in_place_keeps_the_last_ones
 def test_statistics_stand_beside_each_evaluation_after_the_first_gradient_step(tmp_path):
     class Measured(Counter):
         def statistics(self):
-            assert (self.net.count > 0).all()  # not asked before the first gradient step
+            assert (self.net.count > 0).all()  # not called before the first gradient step
             return {"count": self.net.count.detach()[:, 0], "double": 2 * self.net.count.detach()[:, 0]}
 
     config = Config("Counter", "Scripted", steps=50, learning_starts=25, batch_size=4, eval_every=20, eval_episodes=2)

@@ -49,8 +49,8 @@ def test_the_floor_has_the_products_of_an_update(base, name, seeds):
         agent.update(transitions)
     extra = counter.get_total_flops() - 2 * update_products(base, config, OBS, ACTION, seeds).flops
 
-    # In the actor's step the critics' first layer may pass the gradient of its whole input, though only that of the
-    # action is needed: TD3's first critics in one of two updates, SAC's two critics in both.
+    # In the actor's step, the critics' first layer may compute the gradient of its whole input, although only that of
+    # the action is needed: TD3's first critics in one of two updates, SAC's two critics in both.
     critics = seeds if base == "TD3" else 4 * seeds
     assert extra in (0, 2 * critics * batch * config.hidden[0] * OBS)
 

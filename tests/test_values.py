@@ -1,4 +1,4 @@
-"""Values that a command takes as they are, names of folders that have to be short, and runs for a first look."""
+"""Values that a command takes literally, folder names that must be short, and runs for a first look."""
 
 import json
 import os
@@ -79,7 +79,7 @@ def test_quick_evaluates_little_and_says_so_everywhere(tmp_path, capsys):
     assert all("quick=true" in name for name in figures if name != "R+N-training.png") and len(figures) >= 2
     train(tmp_path / "whole", words + " eval_episodes=2 final_episodes=1")
     quick, whole = outcome(tmp_path / "quick"), outcome(tmp_path / "whole")
-    for seed in quick:  # what is learned is the same
+    for seed in quick:  # both runs learn the same
         ours, others = quick[seed]["parameters"]["last"], whole[seed]["parameters"]["last"]
         assert all(ours[name].equal(others[name]) for name in others)
     assert "quick" not in yaml.safe_load((find_runs(tmp_path / "whole")[0] / "config.yaml").read_text())

@@ -1,4 +1,4 @@
-"""Words of a command line (core/words.py): `key=value`, names out of a list, whole numbers."""
+"""Words of a command line (core/words.py): `key=value`, names from a list, whole numbers."""
 
 import pytest
 

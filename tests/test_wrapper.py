@@ -175,7 +175,7 @@ def test_features_make_of_any_observation_what_the_constraint_sees():
 
 
 def both_sides(mapping="project"):
-    """Wrappers inside and outside; the constraint sees three observations in a row."""
+    """`Constrained` with wrappers inside and outside; the constraint sees a stack of three observations."""
     inside = wrappers.RescaleAction(wrappers.TimeLimit(Robot("rgb_array"), 20), -3.0, 3.0)
     inside = wrappers.FlattenObservation(wrappers.FrameStackObservation(inside, 3))
     newest = InUnits(LinearConstraint(2, A=partial(newest_row, 6), b=bound_of_one), -3.0, 3.0)
@@ -325,7 +325,7 @@ def test_a_constraint_that_breaks_down_is_noticed():
 
 
 def test_a_constraint_in_units_is_the_same_set():
-    """On actions u of [low, high], with every method: u satisfies the inner set where a satisfies the outer one."""
+    """In every method: an action in [low, high] is in the inner set exactly if its rescaled action is in the outer."""
     generator = torch.Generator().manual_seed(0)
     low, high = np.array([-2.0, 0.0, 5.0]), np.array([2.0, 10.0, 6.0], np.float64)
     A = torch.randn(4, 3, generator=generator, dtype=torch.float64)
@@ -405,7 +405,7 @@ def test_an_empty_set_is_reported_by_the_step():
 
 
 def test_a_number_in_units_keeps_its_double_precision():
-    bound = 0.05  # single precision makes 0.0500000007 of it
+    bound = 0.05  # in single precision it is 0.0500000007
     constraint = InUnits(Ball(bound, 2), -1.0, 1.0)
     projected = constraint.project(torch.zeros(1), torch.tensor([1.0, 0.0], dtype=torch.float64))
     assert projected[0].item() == pytest.approx(bound**0.5, rel=1e-14)

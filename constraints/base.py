@@ -34,6 +34,11 @@ OnEmpty = Literal["error", "least"]
 AT_FACE = 1.0 - 1e-9
 """The box holds a coordinate of a projection from this absolute value on: rounding may have moved it off the face."""
 
+_DERIVED = {"center", "gauge", "ray", "alpha_map", "radial_map", "gauge_map"}
+_DERIVED |= {"radial_log_prob", "gauge_log_prob", "alpha_log_prob"}
+"""Methods that a subclass must not override. Maps and densities call each other's parts, so some calls would bypass the
+override: an actor would train with one centre and be evaluated with another."""
+
 
 class Ellipse(NamedTuple):
     """(a - center)' matrix (a - center) <= bound."""
@@ -64,6 +69,16 @@ class Constraint(ABC):
     """What happens if no action satisfies the constraint, "error" or "least"; see `GeneralConstraint`."""
     solved_on_cpu: bool = False
     """True if a solver runs on the CPU. A GPU has to wait for it, and a CUDA graph cannot contain it."""
+
+    def __init_subclass__(cls, **kwargs: Any):
+        """Raise TypeError for an override of a method in `_DERIVED`."""
+        super().__init_subclass__(**kwargs)
+        if wrong := sorted(_DERIVED & vars(cls).keys()):
+            raise TypeError(
+                f"{cls.__name__} overrides {', '.join(wrong)}, which some calls would bypass: override _center(at) or"
+                " _gauge_gradients(at, direction, center), c(obs) for the centre of a QuadraticConstraint's ellipse, or"
+                " write a map (core/maps.py)"
+            )
 
     def __init__(self, dim: int):
         if dim < 1:

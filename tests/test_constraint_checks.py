@@ -105,6 +105,34 @@ def test_a_bound_may_not_be_a_tensor():
         WeightedL1([1.0, 2.0], 1.0, 2)
 
 
+def test_a_coefficient_of_a_subclass_is_a_method():
+    class Sphere(QuadraticConstraint):
+        bound = 0.05
+
+    with pytest.raises(TypeError, match=r"^bound must be a function of the observation, got float$"):
+        Sphere(2, Q=lambda obs: torch.eye(2)).project(torch.zeros(1), torch.ones(2))
+
+
+@pytest.mark.parametrize("name", ["center", "gauge", "ray", "radial_map", "alpha_log_prob"])
+@pytest.mark.parametrize("base", [Ball, QuadraticConstraint, HalfSpace])
+def test_methods_that_others_bypass_are_not_overridden(base, name):
+    """Training reads the stored `center`, evaluation reads `_center`: an override of one would part the two."""
+    with pytest.raises(TypeError, match=f"^Mine overrides {name}, which some calls would bypass: override _center"):
+        type("Mine", (base,), {name: lambda self, obs: obs})
+
+
+def test_a_centre_of_ones_own_serves_every_map():
+    class Corner(LinearConstraint):
+        def _center(self, at):
+            return self.at(at).obs[..., :2]
+
+    corner = Corner(2, A=lambda obs: torch.ones(1, 2), b=lambda obs: torch.zeros(1))
+    obs, action = torch.tensor([-0.5, -0.25]).double(), torch.zeros(2).double()
+    assert torch.equal(corner.center(obs), obs) and torch.equal(corner.gauge_map(obs, action), obs)
+    own, given = corner.radial_map(obs, action), corner.radial_map(obs, action, obs)
+    assert torch.equal(own, given) and not torch.equal(own, obs)
+
+
 SETS: dict[str, Constraint] = {
     "l1": WeightedL1(lambda obs: obs[..., :2], 1.0, 2),
     "positive part": WeightedPositivePart(lambda obs: obs[..., :2], 1.0, 2),

@@ -370,10 +370,6 @@ def test_states_further_out_are_left_where_the_set_breaks_down_there():
                 raise flow_training.ConstraintError("no such state")
             return super()._at(obs)
 
-        def center(self, obs):
-            self._at(obs.double())
-            return super().center(obs)
-
     training = FlowTraining(Flow(), Narrow(lambda obs: obs[..., :2], 0.2, 2), states())
     assert training.obs.abs().max() <= 0.5
     assert FlowTraining(Flow(), CONSTRAINT, states()).obs.abs().max() > 0.8

@@ -11,7 +11,14 @@ import torch
 from torch import Tensor
 
 from constraints.base import Constraint, ExplicitSet, OnEmpty
-from constraints.checks import ON_BOUNDARY, check_each_alone, check_observation, check_tensor, checked
+from constraints.checks import (
+    ON_BOUNDARY,
+    check_each_alone,
+    check_function,
+    check_observation,
+    check_tensor,
+    checked,
+)
 from constraints.ellipse import ellipse_gauge_gradient
 from constraints.errors import ConstraintError, EmptySetError, name_samples, require
 from constraints.general.active_set import project_on_rows
@@ -83,6 +90,7 @@ class GeneralConstraint(Constraint):
 
     def _values(self, function: Callable[[Tensor], Any], what: str, shape: tuple[int, ...], obs: Tensor) -> Tensor:
         """The values of a function at obs (..., n), as `checked` returns them."""
+        check_function(what.removesuffix("(obs)"), function)
         values = checked(function(obs), what, shape, obs)
         if what not in self._compared and obs.shape[:-1].numel() > 1 and not is_transformed():
             self._compared.add(what)

@@ -356,7 +356,7 @@ def main(arguments: list[str]) -> int:
             solvers.append(name)
     records = [record for task in tqdm(tasks, unit="task") for record in measure(task, batches, solvers)]
     text = (
-        f"Milliseconds of CPU time a batch, on {machine()}. `~`: measured on fewer samples and taken in proportion. "
+        f"Milliseconds of CPU time per batch, on {machine()}. `~`: measured on fewer samples and extrapolated. "
         "`active`: share of the actions that are infeasible.\n\n" + table(records, batches) + "\n"
     )
     print(text)

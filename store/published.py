@@ -98,6 +98,8 @@ def write_published(folder: str | Path, runs: Iterable[PublishedRun]) -> None:
     _write_table(folder / EVALUATIONS, [row for run in runs for row in _evaluation_rows(run)])
     if training := [row for run in runs for row in _training_rows(run)]:
         _write_table(folder / TRAINING, training)
+    else:
+        (folder / TRAINING).unlink(missing_ok=True)
     _write_table(folder / RUNS, [run.row() for run in runs])
 
 

@@ -138,18 +138,18 @@ class Flow(Map):
 
     flow: str = setting(
         "reverse",
-        "DFlow, SFlow: how the flow is trained, mle (as FlowPG) or reverse (as CV-Flow)",
+        "DFlow, SFlow: training of the flow, mle (as in FlowPG) or reverse (as in CV-Flow)",
         one_of("mle", "reverse"),
     )
     flow_width: int = setting(64, "DFlow, SFlow: units in a hidden layer of the flow", AT_LEAST_ONE)
     flow_steps: int = setting(3_000, "DFlow, SFlow: gradient steps of the flow's training", AT_LEAST_ONE)
-    flow_batch_size: int = setting(256, "DFlow, SFlow: samples in such a step", AT_LEAST_ONE)
-    flow_learning_rate: float = setting(1e-3, "DFlow, SFlow: Adam's at the start; a cosine takes it to 0", POSITIVE)
+    flow_batch_size: int = setting(256, "DFlow, SFlow: samples per gradient step of the flow's training", AT_LEAST_ONE)
+    flow_learning_rate: float = setting(1e-3, "DFlow, SFlow: learning rate of the flow; it falls to 0", POSITIVE)
     mle_softness: float = setting(
-        0.02, "DFlow, SFlow: width of the box's edges, for flow=mle", POSITIVE, only_with=("flow", "mle")
+        0.02, "DFlow, SFlow: width of the box's soft edges, for flow=mle", POSITIVE, only_with=("flow", "mle")
     )
     reverse_softness: float = setting(
-        1e-4, "DFlow, SFlow: width of the set's edges, for flow=reverse", POSITIVE, only_with=("flow", "reverse")
+        1e-4, "DFlow, SFlow: width of the set's soft edges, for flow=reverse", POSITIVE, only_with=("flow", "reverse")
     )
 
     flow_entropy: str = setting(

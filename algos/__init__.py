@@ -59,7 +59,7 @@ class Algorithm:
         for key, f in keys_of(self.map).items():
             if {key, f.name} & taken:
                 raise ValueError(
-                    f"{type(self.map).__name__}.{f.name} has the name of a setting of {self.agent.__name__}"
+                    f"{type(self.map).__name__}.{f.name} has the same name as a setting of {self.agent.__name__}"
                 )
         inherited = keys_of(Config)
         for schema in (type(self.map), self.agent.config_class):

@@ -293,10 +293,10 @@ def test_a_setting_that_cannot_be_a_key_is_refused():
     Algorithm(TD3, Dense(), "layer")
     Algorithm(TD3, Weighted(), "layer")
     for agent, map, penalty, reason in (
-        (TD3, Slow(), False, "Slow.tau has the name of a setting of TD3"),
-        (SAC, Dense(), False, "Dense.gsde has the name of a setting of SAC"),
-        (TD3, Seeded(), False, "Seeded.seed has the name of a setting of TD3"),
-        (TD3, Weighted(), True, "Weighted.penalty has the name of a setting of TD3"),
+        (TD3, Slow(), False, "Slow.tau has the same name as a setting of TD3"),
+        (SAC, Dense(), False, "Dense.gsde has the same name as a setting of SAC"),
+        (TD3, Seeded(), False, "Seeded.seed has the same name as a setting of TD3"),
+        (TD3, Weighted(), True, "Weighted.penalty has the same name as a setting of TD3"),
         (TD3, Plain(), False, "Plain.scale must be made with core.config.setting"),
         (PlainDDPG, Soft(), False, "PlainConfig.rate must be made with core.config.setting"),
     ):

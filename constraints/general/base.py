@@ -103,8 +103,8 @@ class GeneralConstraint(Constraint):
             return at
         if is_mapped():
             raise RuntimeError(
-                f"{type(self).__name__} looks at values, which torch.func.vmap hides from all methods but project; they"
-                " take batches of any leading shape as they are"
+                f"{type(self).__name__} supports torch.func.vmap only in project; its other methods take batches of"
+                " any leading shape without vmap"
             )
         return self._coefficients(at)
 
@@ -196,7 +196,9 @@ class GeneralConstraint(Constraint):
                 return deep_points(sets)
             center, guess = interior_points(sets.detach()), guessed_points(sets)
             if not torch.equal(center, guess):
-                self._refuse_derivatives(at, "where the centre of its ellipse, or the origin, is not deep inside")
+                self._refuse_derivatives(
+                    at, "where the centre of its ellipse, or the origin, is not deep inside the set"
+                )
                 return center
             return guess
 

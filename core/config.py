@@ -137,7 +137,7 @@ class Config:
         "loggers: csv (the run's own files, always on), tensorboard, wandb, or both: tensorboard,wandb",
         Rule(
             lambda value: set(value.split(",")) <= {CSV, *LOGGERS},
-            f"must list some of {', '.join((CSV, *LOGGERS))}, with commas between them",
+            f"must be one or several of {', '.join((CSV, *LOGGERS))}, comma separated",
         ),
     )
 
@@ -172,7 +172,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
         if high < low:
             raise ConfigError(f"bad seed {text!r}: the range {part!r} is empty")
         if high - low >= 1000 or high >= 2**31:
-            raise ConfigError(f"bad seed {text!r}: at most 1000 seeds a range, each below 2^31")
+            raise ConfigError(f"bad seed {text!r}: a range has at most 1000 seeds, each below 2^31")
         seeds.update(range(low, high + 1))
     return tuple(sorted(seeds))
 
@@ -193,7 +193,7 @@ def split_values(schema: type, key: str, text: str) -> list[str]:
     elif re.fullmatch(r"\[[^][]*\](,\[[^][]*\])*", text):
         values = re.findall(r"\[[^][]*\]", text)
     else:
-        raise ConfigError(f"bad value {text!r} for {key}: expected one list, as 64,64, or several, as [64,64],[128]")
+        raise ConfigError(f"bad value {text!r} for {key}: expected one list (64,64) or several ([64,64],[128])")
     if not all(values):
         raise ConfigError(f"bad value {text!r} for {key}: a value between commas is empty")
     return list(dict.fromkeys(values))

@@ -209,7 +209,7 @@ class Flow(Map):
     def _on(self, device: torch.device) -> ConditionalFlow:
         """The flow on `device`. Raises RuntimeError if there is no flow yet."""
         if not self._networks:
-            raise RuntimeError("this map has no flow yet: sweep.flows trains one, and load_state takes it")
+            raise RuntimeError("this map has no flow yet: train one with sweep.flows, and load it with load_state")
         if device not in self._networks:
             self._networks[device] = copy.deepcopy(self._networks[CPU]).to(device)
         return self._networks[device]

@@ -54,9 +54,7 @@ def make_robot(name: str, task: Task, simulator: str | None = None) -> Robot:
     if simulator is None:
         return robot()
     if simulator not in robot.simulators:
-        choices = (
-            f"choices: {' '.join(robot.simulators)}" if robot.simulators else "its robot has no choice of simulators"
-        )
+        choices = f"choices: {' '.join(robot.simulators)}" if robot.simulators else "its robot has only one simulator"
         raise UnavailableError(f"unknown simulator {simulator!r} for {name} ({choices})")
     module, _, name = robot.simulators[simulator].partition(":")
     return getattr(importlib.import_module(module), name)()
@@ -74,7 +72,7 @@ def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.nda
     environment has been stepped then.
     """
     if len(set(map(id, envs))) < len(envs) or any(env.constraint is not envs[0].constraint for env in envs):
-        raise ValueError("step_together() takes different environments of one constraint")
+        raise ValueError("step_together() needs different environments with the same constraint")
     if _all_well_formed(envs, actions):
         outcomes: list[Any] = [*actions]
     else:

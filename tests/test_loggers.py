@@ -159,7 +159,7 @@ def test_an_unknown_logger_is_refused(tmp_path, capsys, value):
     assert run_command(f"algo=DRad {WORDS} log={value} results={tmp_path}".split()) == 2
     assert (
         capsys.readouterr().err
-        == f"run.py: bad value {value!r} for log: must list some of csv, tensorboard, wandb, with commas between them\n"
+        == f"run.py: bad value {value!r} for log: must be one or several of csv, tensorboard, wandb, comma separated\n"
     )
 
 

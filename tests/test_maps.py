@@ -136,11 +136,11 @@ def test_the_entropy_in_unit_ball_coordinates_is_a_setting_of_the_map():
     [
         (SAC, Project(), "layer", "SAC needs the log-density of mapped actions, and Project has no with_log_prob"),
         (SAC, Project(), "rollout", "SAC is implemented for placement environment and layer, not rollout"),
-        (SAC, Alpha(), "environment", "Alpha can stand in placement layer, not environment"),
+        (SAC, Alpha(), "environment", "Alpha supports placement layer, not environment"),
         (SAC, Gauge(), "rollout", "SAC is implemented for placement environment and layer, not rollout"),
         (SAC, Bare(), "layer", "Bare has no with_log_prob"),
-        (TD3, Alpha(), "rollout", "Alpha can stand in placement layer, not rollout"),
-        (TD3, Gauge(), "environment", "Gauge can stand in placement layer, not environment"),
+        (TD3, Alpha(), "rollout", "Alpha supports placement layer, not rollout"),
+        (TD3, Gauge(), "environment", "Gauge supports placement layer, not environment"),
         (TD3, Project(), "wrapper", "unknown placement 'wrapper'"),
         (NFWPO, Project(), "layer", "NFWPO is implemented for placement rollout, not layer"),
         (NFWPO, Radial(), "rollout", "NFWPO is implemented for Project, not Radial"),
@@ -178,7 +178,7 @@ def test_an_agent_that_is_not_complete_is_refused_with_what_is_missing():
         Algorithm(Half, Project(), "layer")
     missing = "explore, networks, optimizers, policy, update, family, paper"
     assert str(error.value) == f"Half is not complete: it does not define {missing}"
-    with pytest.raises(ValueError, match="^Nameless.paper has no 'Others'"):
+    with pytest.raises(ValueError, match="^Nameless.paper needs an entry 'Others'"):
         Algorithm(Nameless, Project(), "layer")
 
 

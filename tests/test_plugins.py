@@ -161,7 +161,9 @@ def test_a_plugin_without_a_name(tmp_path, monkeypatch, capsys, value):
 
 
 def test_a_name_is_registered_once_and_fits_on_a_command_line():
-    with pytest.raises(ValueError, match="the algorithm 'DPre' exists: take another name, or delete it first"):
+    with pytest.raises(
+        ValueError, match="the algorithm 'DPre' exists already: choose another name, or delete it first"
+    ):
         ALGORITHMS["DPre"] = ALGORITHMS["DPro"]
     for more in ({"DPre": ALGORITHMS["DPro"]}, {"a b": ALGORITHMS["DPro"]}):
         with pytest.raises(ValueError):

@@ -160,7 +160,7 @@ def load_policy(folder: str | Path, which: str = "best") -> Policy:
     config = replace(saved_config(settings), device="cpu")
     algorithm = ALGORITHMS[config.algo]
     if changed := changes(folder, define(robot, constraint, algorithm)):
-        warnings.warn(f"{folder} was trained on {changed}", stacklevel=2)
+        warnings.warn(f"{folder} was trained with {changed}", stacklevel=2)
     try:
         agent = algorithm.build(config, constraint, obs_dim, config.seeds)
     except (TypeError, ValueError) as error:

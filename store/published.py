@@ -193,7 +193,7 @@ def _read_table(path: Path) -> list[dict[str, str]]:
         rows = list(csv.DictReader(io.StringIO(text.decode(), newline="")))
         for number, row in enumerate(rows, 1):
             if None in row or None in row.values():
-                raise ValueError(f"row {number} has not as many fields as the header")
+                raise ValueError(f"row {number} does not have as many fields as the header")
             _key(row)
     return rows
 

@@ -116,8 +116,8 @@ def test_a_program_can_be_its_own_plugin(plugin):
     [
         ("other.py", None, "expected a Python file (.py), and there is no such file"),
         ("other.txt", "", "expected a Python file (.py)"),
-        ("random.py", "", "has the name of another module, random: rename it"),
-        ("algos.py", "", "has the name of another module, algos: rename it"),
+        ("random.py", "", "has the same name as another module, random: rename it"),
+        ("algos.py", "", "has the same name as another module, algos: rename it"),
         ("other.py", "x = 1\ny = (\n", "other.py, line 2: SyntaxError: "),
         ("other.py", "import os\n\nraise KeyError('a\\nb')\n", "other.py, line 3: KeyError: "),
         ("other.py", "import no_such_module\n", "other.py, line 1: ModuleNotFoundError: No module named"),
@@ -131,7 +131,7 @@ def test_a_program_can_be_its_own_plugin(plugin):
         (
             "other.py",
             "from sweep.train import train_words\ntrain_words('algo=DPre env=R+N')\n",
-            "line 2: ConfigError: a plugin only registers: train below `if __name__",
+            "line 2: ConfigError: a plugin must not train when it is imported: train below `if __name__",
         ),
     ],
 )

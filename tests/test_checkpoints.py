@@ -72,7 +72,7 @@ def test_without_a_whole_checkpoint_a_run_starts_again_and_the_old_one_is_kept(t
     train(tmp_path, CHECKPOINTED)
     captured = capsys.readouterr()
     assert captured.err.count("damaged checkpoint: wrong checksum") == 2
-    assert "other seeds before" in captured.out and captured.out.count("resuming") == 1
+    assert "seeds were trained together" in captured.out and captured.out.count("resuming") == 1
     assert f"{second}: resuming" in captured.out
     assert (first.parent / "seed=3.old-1" / "checkpoint").is_dir()
     assert set(outcome(tmp_path)) == {"seed=3", "seed=5"}

@@ -630,7 +630,7 @@ def test_a_submission_that_another_host_left_open_names_its_lock(cluster, capsys
     lock.write_text(json.dumps({"pid": 7, "host": "elsewhere"}))
     assert run_command(["algo=DPre", "env=R+N", "launcher=slurm", f"results={cluster / 'results'}"]) == 2
     err = capsys.readouterr().err
-    assert err.count("\n") == 1 and f"by process 7 on elsewhere; if that has ended, delete {lock}" in err
+    assert err.count("\n") == 1 and f"by process 7 on elsewhere; if that process has ended, delete {lock}" in err
 
 
 def test_what_sbatch_refuses_is_said_in_one_line(cluster, monkeypatch, capsys):

@@ -223,7 +223,7 @@ def test_observations_in_single_precision(dtype):
             obs, wanted = env.reset()[0], exact.reset()[0]
     assert env.largest_violation == exact.largest_violation <= envs.TOLERANCE
     for bad in (np.int64, "float16"):
-        with pytest.raises(ValueError, match="of observations .choices: float64 float32"):
+        with pytest.raises(ValueError, match="of observations .choices: float64, float32"):
             envs.make("R+N", dtype=bad)
 
 

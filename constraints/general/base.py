@@ -64,7 +64,7 @@ class GeneralConstraint(Constraint):
     def __init__(self, dim: int, on_empty: OnEmpty = "error"):
         super().__init__(dim)
         if on_empty not in ("error", "least"):
-            raise ValueError(f"on_empty is {on_empty!r} (choices: 'error' 'least')")
+            raise ValueError(f"unknown on_empty {on_empty!r} (choices: error, least)")
         self.on_empty = on_empty
         self._compared: set[str] = set()
 

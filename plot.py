@@ -1,27 +1,27 @@
 """Tables and figures of the benchmark.
 
     python plot.py results/          all runs of a folder of results or of published data (docs/data), finished or not:
-                                       tables/rewards       mean and standard error of the finished runs
-                                       tables/comparison    the same beside the paper's table
+                                       tables/rewards       mean and standard error over the finished runs
+                                       tables/comparison    the same, beside the paper's values
                                        tables/adjusted      Reacher's returns without the luck of the starts
                                        tables/aggregate     interquartile mean over tasks, with intervals
                                        tables/improvement   probability that one algorithm is better than another
                                        figures/<task>       learning curves, also of runs in progress
-                                       figures/<task>-training   return and training measures, all settings
+                                       figures/<task>-training   return and training measures of all settings
                                        figures/aggregate, figures/improvement
     python plot.py results/ OTHER/=label ...   the same, with the runs of other folders or of CSV files (columns
                                      task,algorithm,seed,step,return) beside them, as "SRad (label)"
     python plot.py tables            tables/tasks and tables/hyperparameters, from the code's definitions
     python plot.py maps              figures/maps: the three feasibility maps, the paper's Figure 1
     python plot.py actions RUN       figures/actions-...: feasible set and executed actions over an episode with
-                                     the best parameters of a run, as RUN=results/R+L2/SRad/seed=0
-    python plot.py runtime [FILE]    figures/runtime: bars of what bench/runtime.py saved
+                                     the best parameters of a run, such as results/R+L2/SRad/seed=0
+    python plot.py runtime [FILE]    figures/runtime: bars of the times that bench/runtime.py saved
                                      (default bench/results/runtime.csv)
 
-options: env=W+M,R+L2 and algo=DPre+,SRad   only these, of a folder of results (default all)
+options: env=W+M,R+L2 and algo=DPre+,SRad   only these tasks and algorithms of the results (default all)
          paper=beside                       the paper's columns beside ours in tables/rewards
          out=DIR                            write below DIR (default: the folder of results, or results)
-         format=md,csv,tex,png,pdf          only these (default all)
+         format=md,csv,tex,png,pdf          only these formats (default all)
          plugin=my.py                       your own files that register tasks and algorithms
 """
 

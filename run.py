@@ -28,22 +28,22 @@ def usage() -> str:
         "  python run.py algo=SRad env=W+M seed=3             one run",
         "  python run.py algo=SRad env=W+M seed=0-9           ten seeds, trained in lockstep in one process",
         "  python run.py algo=DOpt,DRad env=all seed=0,1      several cells, one after the other",
-        "  python run.py algo=SRad env=R+L2 tau=0.01,0.02     a cell for each value; several lists: all combinations",
-        "  python run.py algo=paper env=all seed=0-9 jobs=4   a queue of cells, four at a time, a process each",
+        "  python run.py algo=SRad env=R+L2 tau=0.01,0.02     one cell per value; several lists: all combinations",
+        "  python run.py algo=paper env=all seed=0-9 jobs=4   a queue of cells, four at a time, one process each",
         "  python run.py algo=paper env=all seed=0-9 launcher=slurm slurm.hours=12    an array of Slurm jobs",
-        "  python run.py status results/                      how all cells stand, running, queued or ended",
-        "  python run.py play FOLDER [episodes=3] [which=best] [video=FILE.mp4]    run and film the policy of a run",
+        "  python run.py status results/                      the state of all cells: running, queued or ended",
+        "  python run.py play FOLDER [episodes=3] [which=best] [video=FILE.mp4]    play and film the policy of a run",
         "",
-        f"algo: {' '.join(ALGORITHMS)}; paper (the paper's own) or all",
+        f"algo: {' '.join(ALGORITHMS)}; paper (the paper's 13) or all",
         f"env:  {' '.join(TASKS)}; or all",
         "",
-        "keys (defaults depend on algorithm and task: the paper's hyperparameter table):",
+        "keys (the defaults are the paper's hyperparameters of the algorithm and the task):",
     ]
     lines += [f"  {key:18s} {f.metadata['help']}" for key, f in setting_keys().items() if key not in ("algo", "env")]
     lines += ["", "keys of a sweep (not part of any run's name):", f"  {KEY:18s} {HELP}"]
     for schema, prefix in ((SweepSettings, ""), (SlurmSettings, SLURM_PREFIX)):
         lines += [f"  {prefix + f.name:18s} {f.metadata['help']}" for f in fields(schema)]
-    lines.append("  slurm.NAME         any other parameter of sbatch, as slurm.account=mine slurm.exclusive=true")
+    lines.append("  slurm.NAME         any other parameter of sbatch, such as slurm.account=mine slurm.exclusive=true")
     return "\n".join(lines)
 
 

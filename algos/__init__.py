@@ -59,7 +59,7 @@ class Algorithm:
         for key, f in keys_of(self.map).items():
             if {key, f.name} & taken:
                 raise ValueError(
-                    f"{type(self.map).__name__}.{f.name} has the name of a setting of {self.agent.__name__}"
+                    f"{type(self.map).__name__}.{f.name} has the same name as a setting of {self.agent.__name__}"
                 )
         inherited = keys_of(Config)
         for schema in (type(self.map), self.agent.config_class):
@@ -160,7 +160,7 @@ def load_policy(folder: str | Path, which: str = "best") -> Policy:
     config = replace(saved_config(settings), device="cpu")
     algorithm = ALGORITHMS[config.algo]
     if changed := changes(folder, define(robot, constraint, algorithm)):
-        warnings.warn(f"{folder} was trained on {changed}", stacklevel=2)
+        warnings.warn(f"{folder} was trained with {changed}", stacklevel=2)
     try:
         agent = algorithm.build(config, constraint, obs_dim, config.seeds)
     except (TypeError, ValueError) as error:

@@ -38,19 +38,19 @@ class ARAMConfig(Config):
     is negative, the delay is a gain and works against the penalty. `reward_shift` can therefore raise the rewards.
     """
 
-    temperature: float = setting(0.2, "ARAM: weight of the entropy at the start", POSITIVE)
-    learn_temperature: bool = setting(True, "ARAM: adapt that weight, as SAC does")
-    reward_shift: float = setting(0.0, "ARAM: added to the task's rewards in gradient steps")
+    temperature: float = setting(0.2, "ARAM: initial weight of the entropy", POSITIVE)
+    learn_temperature: bool = setting(True, "ARAM: learn the weight of the entropy, as SAC does")
+    reward_shift: float = setting(0.0, "ARAM: constant added to the task's rewards in gradient steps")
     rejection_penalty: float = setting(0.2, "ARAM: cost of a rejected action", NOT_NEGATIVE)
-    most_rejections: int = setting(100, "ARAM: rejected draws after which the last one is projected", AT_LEAST_ONE)
-    rejected_share: float = setting(0.2, "ARAM: share of rejected actions in a batch", SHARE)
-    rejected_share_decay: float = setting(0.99, "ARAM: factor of that share, every so many steps", POSITIVE_SHARE)
-    rejected_share_every: int = setting(10_000, "ARAM: environment steps from factor to factor", AT_LEAST_ONE)
-    rejected_kept: int = setting(100_000, "ARAM: rejected actions kept, a seed", AT_LEAST_ONE)
-    preferences: int = setting(4, "ARAM: preferences that the actor's step compares", AT_LEAST_ONE)
-    snapshots: int = setting(4, "ARAM: earlier critics that it compares as well", AT_LEAST_ONE)
-    snapshot_every: int = setting(1_000, "ARAM: gradient steps between these critics", AT_LEAST_ONE)
-    snapshots_after: int = setting(20_000, "ARAM: gradient steps without one", NOT_NEGATIVE)
+    most_rejections: int = setting(100, "ARAM: rejected draws before the last draw is projected", AT_LEAST_ONE)
+    rejected_share: float = setting(0.2, "ARAM: initial share of rejected actions in a batch", SHARE)
+    rejected_share_decay: float = setting(0.99, "ARAM: factor by which rejected_share decays", POSITIVE_SHARE)
+    rejected_share_every: int = setting(10_000, "ARAM: environment steps between these decays", AT_LEAST_ONE)
+    rejected_kept: int = setting(100_000, "ARAM: rejected actions kept per seed", AT_LEAST_ONE)
+    preferences: int = setting(4, "ARAM: preferences compared in an actor step", AT_LEAST_ONE)
+    snapshots: int = setting(4, "ARAM: earlier critics compared in an actor step", AT_LEAST_ONE)
+    snapshot_every: int = setting(1_000, "ARAM: gradient steps between copies of the critic", AT_LEAST_ONE)
+    snapshots_after: int = setting(20_000, "ARAM: gradient steps at the start without such copies", NOT_NEGATIVE)
     eval_preference: float = setting(0.9, "ARAM: weight of the task's reward in evaluations", SHARE)
 
 

@@ -67,19 +67,19 @@ def check_parameters(name: str, alone: Agent, among: Agent) -> None:
     """
     one, several = ({key: tuple(p.shape) for key, p in _parameters(agent).items()} for agent in (alone, among))
     if one.keys() != several.keys():
-        raise ContractError(f"{name}: parameters have other names with other numbers of seeds: {one} and {several}")
+        raise ContractError(f"{name}: the names of parameters depend on the number of seeds: {one} and {several}")
     for key, shape in one.items():
         if not shape or several[key] != (len(among.seeds) * shape[0], *shape[1:]):
             raise ContractError(
                 f"{name}: parameter {key} has shape {shape} for one seed and {several[key]} for {len(among.seeds)}, so"
-                " seeds would share it; its first axis must have k rows a seed: give core.networks.MLP (or a module of"
-                " your own) one generator of `init` for each row"
+                " seeds would share it; its first axis must have k rows per seed: give core.networks.MLP (or your own"
+                " module) one generator of `init` per row"
             )
     for key, values in alone.state(0).items():
         if not torch.equal(values, among.state(len(among.seeds) - 1)[key]):
             raise ContractError(
-                f"{name}: the initial values of {key} are not the same for a seed alone and among others; row i must be"
-                " drawn from the generator init[i]"
+                f"{name}: the initial values of {key} differ for a seed alone and among others; draw the rows of seed i"
+                " from the generator init[i]"
             )
 
 
@@ -132,26 +132,26 @@ class _Check:
                 trained[id(parameter)] = name
                 if id(parameter) not in known:
                     self._fail(
-                        f"parameter {number} of the optimiser {name!r} is not one of networks(), so no checkpoint would"
-                        " have it; add its module to networks()"
+                        f"parameter {number} of the optimiser {name!r} is not in networks(), so checkpoints would lack"
+                        " it; add its module to networks()"
                     )
         for name, parameter in _parameters(agent).items():
             if parameter.requires_grad and id(parameter) not in trained:
                 self._fail(
-                    f"no optimiser of optimizers() trains parameter {name}; add its optimiser there, or freeze it as"
-                    " core.networks.frozen_copy does"
+                    f"no optimiser in optimizers() trains parameter {name}; add its optimiser, or freeze the parameter"
+                    " as core.networks.frozen_copy does"
                 )
         for name, value in vars(agent).items():
             if isinstance(value, Optimizer) and not any(value is other for other in agent.optimizers().values()):
-                self._fail(f"the optimiser self.{name} is not in optimizers(), so no checkpoint would have it")
+                self._fail(f"the optimiser self.{name} is not in optimizers(), so checkpoints would lack it; add it")
             if isinstance(value, nn.Module) and any(id(parameter) not in known for parameter in value.parameters()):
-                self._fail(f"the module self.{name} is not in networks(), so no checkpoint would have it")
+                self._fail(f"the module self.{name} is not in networks(), so checkpoints would lack it; add it")
         memory = agent.memory()
         for name, tensor in memory.items():
             if tensor.shape[:1] != (len(SEEDS),):
                 self._fail(f"memory()[{name!r}] has shape {tuple(tensor.shape)}, expected (seeds, ...)")
             if tensor.data_ptr() != agent.memory()[name].data_ptr():
-                self._fail(f"memory()[{name!r}] is a copy; return the tensor itself, as resuming writes into it")
+                self._fail(f"memory()[{name!r}] is a copy; return the tensor itself, because resuming writes into it")
 
     # ---------------------------------------------------------------- acting
 
@@ -172,14 +172,14 @@ class _Check:
         agent.warm_up(which)
         if any(not torch.equal(state[1], _stream_states(agent)[name][1]) for name, state in before.items()):
             self._fail(
-                "a call for the seeds in the positions [0, 2] draws from the stream of position 1; give the streams"
-                " which=which in explore, warm_up, start_rollout and start_episode"
+                "a call for the seeds at positions [0, 2] draws from the stream of position 1; pass which=which to the"
+                " streams in explore, warm_up, start_rollout and start_episode"
             )
         for name, row in remembered.items():
             if not torch.equal(row, agent.memory()[name][1]):
                 self._fail(
-                    f"a call for the seeds in the positions [0, 2] changes memory()[{name!r}] of position 1; explore,"
-                    " start_rollout and start_episode must change the rows `which` alone"
+                    f"a call for the seeds at positions [0, 2] changes memory()[{name!r}] of position 1; explore,"
+                    " start_rollout and start_episode may change only the rows `which`"
                 )
         before, batch = _stream_states(agent), obs[which].unsqueeze(1).repeat(1, 3, 1)
         policy = agent.policy(which)
@@ -190,11 +190,11 @@ class _Check:
             agent.clear(i)
         if not torch.equal(action, policy(batch)):
             self._fail(
-                "the policy is not the same when it is called again after a change of the parameters; policy() must"
-                " return a deterministic function with a copy of them, as core.networks.rows_of makes"
+                "a policy is random, or it changes when the parameters change; policy() must return a deterministic"
+                " function with its own copy of the parameters, as core.networks.rows_of makes"
             )
         if any(not torch.equal(a, b) for name, states in before.items() for a, b in _pairs(states, agent, name)):
-            self._fail("the policy of evaluation draws random numbers, and it must be deterministic")
+            self._fail("a policy draws random numbers; policy() must return a deterministic function")
 
     # ---------------------------------------------------------------- learning
 
@@ -204,18 +204,18 @@ class _Check:
             updates = agent.updates
             agent.update(_batch(agent, number))
             if agent.cycle > 1 and agent.updates != updates + 1:
-                self._fail("cycle is not 1, but update() does not count self.updates: add 1 in every call")
+                self._fail(f"cycle is {agent.cycle}, but update() does not add 1 to self.updates in every call")
             statistics = agent.statistics()
             names = list(statistics) if names is None else names
             if list(statistics) != names:
-                self._fail(f"statistics() has the names {list(statistics)} now and {names} before; keep the same ones")
+                self._fail(
+                    f"statistics() returns the names {list(statistics)} now and {names} before; keep the same names"
+                )
             for name, values in statistics.items():
                 if values.shape != (len(SEEDS),):
                     self._fail(f"statistics()[{name!r}] has shape {tuple(values.shape)}, expected (seeds,)")
         if unseen := [name for name in agent.optimizers() if name not in agent.losses]:
-            self._fail(
-                f"update() never gives losses to self.descend({unseen[0]!r}, losses), so no divergence would be seen"
-            )
+            self._fail(f"update() never calls self.descend({unseen[0]!r}, losses), so a divergence would go unnoticed")
         try:
             state = agent.training_state(1)
             agent.load_training_state(1, state)
@@ -230,21 +230,21 @@ class _Check:
             first,
             self._train(SEEDS),
             "two trainings of the same seeds differ",
-            "all randomness must come from self.exploration, self.update_noise and `init`, and nothing may stay from"
-            " an earlier training",
+            "all randomness must come from self.exploration, self.update_noise and `init`, and nothing may remain"
+            " from an earlier training",
         )
         self._compare(
             first,
             self._train(SEEDS, interrupted=True),
-            "a training that was interrupted and resumed differs from an unbroken one",
-            "what the future depends on must be in networks(), optimizers(), streams() or memory()",
+            "a training that was interrupted and resumed differs from an uninterrupted one",
+            "everything that later steps depend on must be in networks(), optimizers(), streams() or memory()",
         )
         self._compare(
             {SEEDS[1]: first[SEEDS[1]]},
             self._train(SEEDS[1:2]),
-            f"seed {SEEDS[1]} learns something else alone than among others",
-            "a loss is the mean over the batch, never over seeds; acting must change the rows `which` alone, and seeds"
-            " may share nothing",
+            f"seed {SEEDS[1]} learns something different alone than among others",
+            "a loss must be the mean over the batch, never over seeds; acting may change only the rows `which`, and"
+            " seeds may share nothing",
             ROUNDING,
         )
 
@@ -268,9 +268,9 @@ class _Check:
                     if not resumed:
                         raise
                     raise ContractError(
-                        f"{self.name}: a training that was interrupted and resumed breaks down, an unbroken one not:"
-                        f" {error!r}; what the future depends on must be in networks(), optimizers(), streams() or"
-                        " memory()"
+                        f"{self.name}: a training that was interrupted and resumed fails, an uninterrupted one runs:"
+                        f" {error!r}; everything that later steps depend on must be in networks(), optimizers(),"
+                        " streams() or memory()"
                     ) from error
             return {seed.number: self._outcome(trainer, seed) for seed in trainer.seeds}
 
@@ -364,8 +364,8 @@ class _Drift(gymnasium.Env):
         violation = float(CONSTRAINT.violation(torch.from_numpy(self.obs), exact))
         if not violation <= TOLERANCE:
             return ValueError(
-                f"action {action.tolist()} violates the constraint by {violation:.3g}; what is executed must come from"
-                " the map: act with self.feasible, and end the policy with it"
+                f"action {action.tolist()} violates the constraint by {violation:.3g}; executed actions must come from"
+                " the map: call self.feasible in acting and at the end of the policy"
             )
         self.largest_violation, self.executed_actions = (
             max(self.largest_violation, violation),

@@ -19,7 +19,7 @@ from core.replay import Batch
 
 @dataclass
 class NFWPOConfig(TD3Config):
-    fw_learning_rate: float = setting(0.01, "NFW: Frank-Wolfe step", POSITIVE_SHARE)
+    fw_learning_rate: float = setting(0.01, "NFW: step size of Frank-Wolfe", POSITIVE_SHARE)
 
 
 class NFWPO(TD3):

@@ -87,5 +87,5 @@ def _read_parameters(folder: Path, which: str) -> tuple[dict[str, Tensor], Path]
     except Exception as error:  # PyTorch passes on any error of its unpickler or archive reader
         raise ConfigError(f"{path} is damaged: {one_line(error) or type(error).__name__}") from error
     if not isinstance(parameters, dict) or not all(isinstance(value, Tensor) for value in parameters.values()):
-        raise ConfigError(f"{path} is damaged: it has no table of tensors")
+        raise ConfigError(f"{path} is damaged: its content is not a dict of tensors")
     return parameters, path

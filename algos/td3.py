@@ -31,9 +31,9 @@ class TD3Config(Config):
     """TD3's own settings. All but the first are constants that the paper takes from Fujimoto et al."""
 
     action_noise: float = setting(0.1, "TD3, NFW: std of exploration noise", NOT_NEGATIVE)
-    policy_delay: int = setting(2, "TD3, NFW: critic steps an actor step", AT_LEAST_ONE)
-    target_noise: float = setting(0.2, "TD3, NFW: std of target smoothing", NOT_NEGATIVE)
-    target_noise_clip: float = setting(0.5, "TD3, NFW: bound of that noise", NOT_NEGATIVE)
+    policy_delay: int = setting(2, "TD3, NFW: critic steps per actor step", AT_LEAST_ONE)
+    target_noise: float = setting(0.2, "TD3, NFW: std of the noise on target actions", NOT_NEGATIVE)
+    target_noise_clip: float = setting(0.5, "TD3, NFW: bound of the noise on target actions", NOT_NEGATIVE)
 
 
 class TD3(Agent):

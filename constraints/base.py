@@ -140,7 +140,7 @@ class Constraint(ABC):
 
     def _center(self, at: Any) -> Tensor:
         """Interior point (..., d), or (d,) if it is the same for every obs. Unused if `origin_centered`."""
-        raise NotImplementedError(f"{type(self).__name__} needs _center, or origin_centered = True")
+        raise NotImplementedError(f"{type(self).__name__} must define _center, or set origin_centered = True")
 
     def _sample(self, obs: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
         """Points (..., count, d), uniform in the set. A set with a closed form overrides this."""
@@ -155,7 +155,7 @@ class Constraint(ABC):
 
     def explicit(self, obs: Tensor) -> ExplicitSet:
         """The set's rows and ellipses at obs (..., n). TypeError by default; a part of an `Intersection` needs it."""
-        raise TypeError(f"{type(self).__name__} does not write out its rows and ellipses")
+        raise TypeError(f"{type(self).__name__} does not define explicit(), which returns its rows and ellipses")
 
     # ---------------------------------------------------------------- the interface
 

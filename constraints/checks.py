@@ -91,8 +91,8 @@ def check_each_alone(function: Callable[[Tensor], Any], values: Tensor, what: st
     last, single = last_of(values, lead), last_of(alone, one.shape[:-1])
     if last.shape != single.shape or not torch.allclose(last, single, _SAME, _SAME * float(last.abs().sum())):
         raise ConstraintError(
-            f"{what} of an observation depends on the others in its batch: it has shape {tuple(values.shape)} at"
-            f" observations {tuple(obs.shape)} and {tuple(alone.shape)} at one of them; it must take each alone"
+            f"{what} of an observation depends on the others in its batch: it has shape {tuple(values.shape)} for"
+            f" observations {tuple(obs.shape)} and {tuple(alone.shape)} for one of them; it must treat each separately"
         )
 
 

@@ -63,7 +63,7 @@ def name_samples(lead: tuple[int, ...]) -> SampleName:
 def check_bound(bound: float) -> None:
     """Raise a ValueError for a bound that is not positive and finite."""
     if not 0.0 < bound < math.inf:
-        raise ValueError(f"bound must be positive for the origin to be interior, and finite, got {bound}")
+        raise ValueError(f"bound must be positive (the origin must be interior) and finite, got {bound}")
 
 
 def require(valid: Tensor, message: str, name: SampleName, error: type[ConstraintError] = ConstraintError) -> None:

@@ -48,7 +48,9 @@ def is_mapped() -> bool:
 def refuse_transforms(what: str) -> None:
     """Raise a RuntimeError if a transform of torch.func is active."""
     if is_transformed():
-        raise RuntimeError(f"{what} has no torch.func transforms; it takes batches of any leading shape as it is")
+        raise RuntimeError(
+            f"{what} does not support torch.func transforms; it takes batches of any leading shape without them"
+        )
 
 
 def is_traced(*values: object) -> bool:

@@ -232,8 +232,8 @@ def _all_patterns(entries: tuple[float, float], dim: int, device: torch.device) 
     """Every pattern (2^dim, dim) of the two entries; ConstraintError if they are too many to be written out."""
     if dim > _MOST_WRITTEN:
         raise ConstraintError(
-            f"a set of {dim} coordinates has 2^{dim} rows, and penalty and explicit write them out for at most"
-            f" {_MOST_WRITTEN} coordinates; violation(obs, action).clamp(min=0) is a penalty without such a limit"
+            f"a set of {dim} coordinates has 2^{dim} rows, but penalty and explicit support at most {_MOST_WRITTEN}"
+            " coordinates; violation(obs, action).clamp(min=0) is a penalty without this limit"
         )
     return _cached_patterns(entries, dim, device)
 

@@ -82,7 +82,7 @@ class Agent(Snapshots):
         if missing:
             raise ValueError(f"{name} is not complete: it does not define {', '.join(missing)}")
         if "Others" not in cls.paper:
-            raise ValueError(f"{name}.paper has no 'Others', the settings of robots without a group of their own")
+            raise ValueError(f"{name}.paper needs an entry 'Others', for robots without a group of their own")
         if isinstance(map, type):
             raise ValueError(f"map must be an object such as {map.__name__}(), got the class")
         if placement not in get_args(Placement):
@@ -93,8 +93,8 @@ class Agent(Snapshots):
             raise ValueError(f"{name} is implemented for placement {' and '.join(cls.placements)}, not {placement}")
         if placement not in map.placements:
             raise ValueError(
-                f"{map_name} can stand in placement {' and '.join(map.placements)}, not {placement}: only a map that"
-                " leaves feasible actions alone can follow an actor that does not know it"
+                f"{map_name} supports placement {' and '.join(map.placements)}, not {placement}: outside the actor, a"
+                " map must leave feasible actions unchanged"
             )
         if cls.needs_log_prob and placement != "environment" and not map.has_log_prob():
             raise ValueError(f"{name} needs the log-density of mapped actions, and {map_name} has no with_log_prob")

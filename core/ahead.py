@@ -99,7 +99,9 @@ class Ahead:
             self.taken, self.drawn = 0, BLOCK
             self.coming = self._draw_later((self.first + BLOCK) % len(self.kinds))
         if (self.first + self.taken) % len(self.kinds) != kind:
-            raise RuntimeError("the kinds of gradient steps do not take turns: `update` must count every step")
+            raise RuntimeError(
+                "the kinds of gradient steps do not alternate: `update` must add 1 to `updates` in every call"
+            )
         self.taken += 1
 
     # ---------------------------------------------------------------- within a step, on the device
@@ -113,7 +115,9 @@ class Ahead:
     def take(self, draw: Draw) -> Tensor:
         """The numbers (seeds, *shape) of the step's next draw. Raises RuntimeError if that is not `draw`."""
         if self.step is None or self.position == len(self.draws) or self.draws[self.position] != draw:
-            raise RuntimeError(f"a gradient step draws {draw}, which the step before it did not")
+            raise RuntimeError(
+                f"a gradient step draws {draw}, unlike the step before it; every step must make the same draws"
+            )
         numbers = self.step[:, self.offset : self.offset + draw.size].reshape(-1, *draw.shape)
         self.position, self.offset = self.position + 1, self.offset + draw.size
         return numbers

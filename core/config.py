@@ -88,58 +88,56 @@ class Config:
     hidden: list[int] = setting(
         [400, 300], "hidden layer widths", Rule(lambda value: min(value) >= 1, "must list positive widths")
     )
-    batch_size: int = setting(100, "transitions in a gradient step", AT_LEAST_ONE)
-    learning_rate: float = setting(1e-3, "Adam's, for every network", POSITIVE)
-    buffer_size: int = setting(1_000_000, "transitions kept for replay, a seed", AT_LEAST_ONE)
+    batch_size: int = setting(100, "transitions per gradient step", AT_LEAST_ONE)
+    learning_rate: float = setting(1e-3, "learning rate of Adam, for every network", POSITIVE)
+    buffer_size: int = setting(1_000_000, "transitions kept for replay per seed", AT_LEAST_ONE)
     tau: float = setting(0.005, "target update ratio", POSITIVE_SHARE)
     learning_starts: int = setting(100_000, "random warm-up steps", NOT_NEGATIVE)
     train_freq: int | str = setting(
         1,
-        "steps in a rollout, or 'episode'",
-        Rule(lambda value: value == "episode" or (isinstance(value, int) and value >= 1), "must be steps or 'episode'"),
+        "environment steps per rollout, or 'episode'",
+        Rule(lambda value: value == "episode" or (isinstance(value, int) and value >= 1), "must be >= 1 or 'episode'"),
     )
     gradient_steps: int = setting(
         1,
-        "after each rollout; -1: as many as its steps",
+        "gradient steps after each rollout; -1: one per step of the rollout",
         Rule(lambda value: value == -1 or value >= 1, "must be -1 or at least 1"),
     )
     # Protocol.
     eval_every: int = setting(5_000, "environment steps between evaluations", AT_LEAST_ONE)
-    eval_episodes: int = setting(5, "episodes of an evaluation", AT_LEAST_ONE)
-    final_episodes: int = setting(50, "episodes of the final result", AT_LEAST_ONE)
-    quick: bool = setting(False, "few evaluation episodes, to try something out; part of the run's name")
+    eval_episodes: int = setting(5, "episodes per evaluation", AT_LEAST_ONE)
+    final_episodes: int = setting(50, "episodes of the final evaluation", AT_LEAST_ONE)
+    quick: bool = setting(False, "few evaluation episodes, for a first try; the run's name shows it")
     # The run itself. None of these settings changes the training beyond float rounding.
-    results: str = setting("results", "folder that results go to")
+    results: str = setting("results", "folder of the results")
     overwrite: str = setting(
         "false",
-        "true: start again in any case; changed: where the run is of another definition; old runs are kept",
+        "true: start again; changed: only if the task or algorithm has changed; the old run is kept",
         Rule(lambda value: value in ("false", "true", "changed"), "must be false, true or changed"),
     )
-    simulator: str | None = setting(
-        None, "simulator of the robot, where there is a choice (Reacher: closed-form, pybullet)"
-    )
+    simulator: str | None = setting(None, "simulator of the robot, if it has several (Reacher: closed-form, pybullet)")
     device: str = setting(
         AUTO,
-        "of networks and replay buffer: auto (a GPU where there is one), cpu, cuda or cuda:1",
+        "device of networks and replay buffer: auto (a GPU if there is one), cpu, cuda or cuda:1",
         # Only the machine that trains can tell whether there is such a GPU.
         Rule(lambda value: bool(re.fullmatch(r"auto|cpu|cuda(:[0-9]+)?", value)), "must be auto, cpu, cuda or cuda:N"),
     )
     threads: int | str = setting(
         AUTO,
-        "CPU threads; auto: a cell alone up to 4 (beside a GPU 8), in a sweep 1",
+        "CPU threads per cell; auto: 1 in a sweep, otherwise up to 4 (with a GPU up to 8)",
         # (PyTorch crashes with a million)
         Rule(
             lambda value: value == AUTO or (isinstance(value, int) and 1 <= value <= MOST_THREADS),
             f"must be auto or from 1 to {MOST_THREADS}",
         ),
     )
-    checkpoint_every: int = setting(10_000, "environment steps of a seed between checkpoints", AT_LEAST_ONE)
+    checkpoint_every: int = setting(10_000, "environment steps between checkpoints", AT_LEAST_ONE)
     log: str = setting(
         CSV,
-        "where numbers go: csv (the run's files, always), tensorboard, wandb, or several, as tensorboard,wandb",
+        "loggers: csv (the run's own files, always on), tensorboard, wandb, or both: tensorboard,wandb",
         Rule(
             lambda value: set(value.split(",")) <= {CSV, *LOGGERS},
-            f"must list some of {', '.join((CSV, *LOGGERS))}, with commas between them",
+            f"must be one or several of {', '.join((CSV, *LOGGERS))}, comma separated",
         ),
     )
 
@@ -148,7 +146,7 @@ class Config:
 class PenaltyConfig(Config):
     """The settings of an algorithm whose name ends in +, with the weight of the penalty."""
 
-    penalty: float = setting(1.0, "names with +: weight of the penalty", NOT_NEGATIVE)
+    penalty: float = setting(1.0, "names that end in +: weight of the penalty", NOT_NEGATIVE)
 
 
 RUN_KEYS = ("algo", "env", "seed", "results", "overwrite", "simulator", "device", "threads", "checkpoint_every", "log")
@@ -174,7 +172,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
         if high < low:
             raise ConfigError(f"bad seed {text!r}: the range {part!r} is empty")
         if high - low >= 1000 or high >= 2**31:
-            raise ConfigError(f"bad seed {text!r}: at most 1000 seeds a range, each below 2^31")
+            raise ConfigError(f"bad seed {text!r}: a range has at most 1000 seeds, each below 2^31")
         seeds.update(range(low, high + 1))
     return tuple(sorted(seeds))
 
@@ -195,7 +193,7 @@ def split_values(schema: type, key: str, text: str) -> list[str]:
     elif re.fullmatch(r"\[[^][]*\](,\[[^][]*\])*", text):
         values = re.findall(r"\[[^][]*\]", text)
     else:
-        raise ConfigError(f"bad value {text!r} for {key}: expected one list, as 64,64, or several, as [64,64],[128]")
+        raise ConfigError(f"bad value {text!r} for {key}: expected one list (64,64) or several ([64,64],[128])")
     if not all(values):
         raise ConfigError(f"bad value {text!r} for {key}: a value between commas is empty")
     return list(dict.fromkeys(values))

@@ -89,4 +89,4 @@ class GradientSteps:
         for draws, streams in zip(self.draws, self.streams, strict=True):
             draws[kind], streams.recorded = streams.recorded or [], None
         if self.agent.updates % self.agent.cycle != (kind + 1) % self.agent.cycle:
-            raise RuntimeError(f"{type(self.agent).__name__}.update must count its steps in `updates`")
+            raise RuntimeError(f"{type(self.agent).__name__}.update must add 1 to `updates` in every call")

@@ -138,18 +138,18 @@ class Flow(Map):
 
     flow: str = setting(
         "reverse",
-        "DFlow, SFlow: how the flow is trained, mle (as FlowPG) or reverse (as CV-Flow)",
+        "DFlow, SFlow: training of the flow, mle (as in FlowPG) or reverse (as in CV-Flow)",
         one_of("mle", "reverse"),
     )
     flow_width: int = setting(64, "DFlow, SFlow: units in a hidden layer of the flow", AT_LEAST_ONE)
     flow_steps: int = setting(3_000, "DFlow, SFlow: gradient steps of the flow's training", AT_LEAST_ONE)
-    flow_batch_size: int = setting(256, "DFlow, SFlow: samples in such a step", AT_LEAST_ONE)
-    flow_learning_rate: float = setting(1e-3, "DFlow, SFlow: Adam's at the start; a cosine takes it to 0", POSITIVE)
+    flow_batch_size: int = setting(256, "DFlow, SFlow: samples per gradient step of the flow's training", AT_LEAST_ONE)
+    flow_learning_rate: float = setting(1e-3, "DFlow, SFlow: learning rate of the flow; it falls to 0", POSITIVE)
     mle_softness: float = setting(
-        0.02, "DFlow, SFlow: width of the box's edges, for flow=mle", POSITIVE, only_with=("flow", "mle")
+        0.02, "DFlow, SFlow: width of the box's soft edges, for flow=mle", POSITIVE, only_with=("flow", "mle")
     )
     reverse_softness: float = setting(
-        1e-4, "DFlow, SFlow: width of the set's edges, for flow=reverse", POSITIVE, only_with=("flow", "reverse")
+        1e-4, "DFlow, SFlow: width of the set's soft edges, for flow=reverse", POSITIVE, only_with=("flow", "reverse")
     )
 
     flow_entropy: str = setting(
@@ -209,7 +209,7 @@ class Flow(Map):
     def _on(self, device: torch.device) -> ConditionalFlow:
         """The flow on `device`. Raises RuntimeError if there is no flow yet."""
         if not self._networks:
-            raise RuntimeError("this map has no flow yet: sweep.flows trains one, and load_state takes it")
+            raise RuntimeError("this map has no flow yet: train one with sweep.flows, and load it with load_state")
         if device not in self._networks:
             self._networks[device] = copy.deepcopy(self._networks[CPU]).to(device)
         return self._networks[device]

@@ -158,7 +158,7 @@ class Radial(RayMap):
 
     log_det_floor: float = setting(
         0.0,
-        "SRad: added to the determinant in the density (released code: 1e-6)",
+        "SRad: constant added to the determinant in the density (released code: 1e-6)",
         NOT_NEGATIVE,
         of_density=True,
     )

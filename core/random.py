@@ -70,7 +70,7 @@ class Streams:
     def _numbers(self, draw: Draw, which: Iterable[int] | None) -> Tensor:
         if self.ahead or self.recorded is not None:
             if which is not None:
-                raise ValueError("a gradient step draws for all seeds: `which` is for exploration")
+                raise ValueError("a gradient step draws for all seeds; `which` is only for exploration")
             if self.ahead:
                 return self.ahead.take(draw)
             self._record(draw)

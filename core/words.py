@@ -33,15 +33,15 @@ class NameTable(MutableMapping[str, Row]):
         if not isinstance(name, str) or not re.fullmatch(r"[^\s,/\\=.][^\s,/\\=]*", name) or name in GROUPS:
             article = "an" if self.kind[0] in "aeiou" else "a"
             raise ValueError(
-                f"{name!r} cannot be the name of {article} {self.kind}: no space, comma, '=' or slash, no leading '.',"
-                f" and none of {', '.join(GROUPS)}"
+                f"{name!r} cannot be the name of {article} {self.kind}: a name has no space, comma, '=' or slash, does"
+                f" not begin with '.', and is none of {', '.join(GROUPS)}"
             )
         self._rows[name] = row
 
     def check_free(self, name: str) -> None:
         """Raise ValueError if there is a row `name`."""
         if name in self._rows:
-            raise ValueError(f"the {self.kind} {name!r} exists: take another name, or delete it first")
+            raise ValueError(f"the {self.kind} {name!r} exists already: choose another name, or delete it first")
 
     def __repr__(self) -> str:
         return repr(self._rows)
@@ -124,7 +124,7 @@ def whole_number(key: str, text: str, least: int = 1) -> int:
     except ValueError:
         number = float("nan")
     if not number.is_integer() or number < least:
-        raise ConfigError(f"bad value {text!r} for {key}: expected whole numbers from {least} on")
+        raise ConfigError(f"bad value {text!r} for {key}: expected a whole number of at least {least}")
     return int(number)
 
 

@@ -18,7 +18,7 @@ _LARGE_GROUP = 50  # `step_together` may take another path for many robots than 
 def check_class(robot: type[Robot]) -> None:
     """Raise RobotError if `robot` is not a robot class, or lacks methods or attributes."""
     if not (isinstance(robot, type) and issubclass(robot, Robot)):
-        raise RobotError(f"a robot is a class that derives from envs.Robot, got {robot!r}")
+        raise RobotError(f"a robot must be a class that derives from envs.Robot, got {robot!r}")
     name = robot.__name__
     if isabstract(robot):
         raise RobotError(f"{name} lacks methods: {', '.join(sorted(robot.__abstractmethods__))}")
@@ -26,12 +26,14 @@ def check_class(robot: type[Robot]) -> None:
         value = getattr(robot, attribute, None)
         if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
             found = f"is {value!r}" if hasattr(robot, attribute) else "is missing"
-            raise RobotError(f"{name}.{attribute} {found}; it is an attribute of the class, a whole number from 1 on")
+            raise RobotError(f"{name}.{attribute} {found}; it must be a class attribute, a whole number of at least 1")
     if not isinstance(robot.hyperparameters, str):
-        raise RobotError(f"{name}.hyperparameters is {robot.hyperparameters!r}; it is the name of a group of robots")
+        raise RobotError(
+            f"{name}.hyperparameters is {robot.hyperparameters!r}; it must be the name of a group of robots"
+        )
     own = [method for method in ("get_state", "set_state") if getattr(robot, method) is not getattr(Robot, method)]
     if len(own) == 1:
-        raise RobotError(f"{name} has {own[0]}() alone; get_state() and set_state() belong together")
+        raise RobotError(f"{name} defines only {own[0]}(); get_state() and set_state() belong together")
 
 
 def check_robot(robot: type[Robot], steps: int = 200) -> None:
@@ -90,7 +92,7 @@ class _Check:
         rng = _random_numbers()
         obs = self.call("reset", machine.reset, rng)
         if isinstance(obs, tuple):
-            self.fail(".reset() returns a tuple; it returns the observation alone, without an info")
+            self.fail(".reset() returns a tuple; it must return only the observation, without an info")
         self.observation("reset", obs)
         steps: list[Step] = [(obs.copy(), rng.random(), False, {})]
         seen, infos = [(obs, obs.copy())], list[dict[str, Any]]()
@@ -100,15 +102,15 @@ class _Check:
             if not isinstance(answer, tuple) or len(answer) != 4:
                 found = f"{len(answer)} values" if isinstance(answer, tuple) else f"a {type(answer).__name__}"
                 hint = "; leave out `truncated`, which the environment sets" if found == "5 values" else ""
-                self.fail(f".step() returns {found}; it returns four, (obs, reward, terminated, info){hint}")
+                self.fail(f".step() returns {found}; it must return four, (obs, reward, terminated, info){hint}")
             obs, reward, terminated, info = answer
             self.observation("step", obs)
             if not isinstance(reward, Real) or isinstance(reward, bool) or not math.isfinite(reward):
-                self.fail(f".step() returns the reward {reward!r}; it is one finite number")
+                self.fail(f".step() returns the reward {reward!r}; it must be one finite number")
             if not isinstance(terminated, bool | np.bool_):
-                self.fail(f".step() returns terminated as {terminated!r}; it is True or False")
+                self.fail(f".step() returns terminated as {terminated!r}; it must be True or False")
             if not isinstance(info, dict):
-                self.fail(f".step() returns info as {info!r}; it is a dict")
+                self.fail(f".step() returns info as {info!r}; it must be a dict")
             if any(info is other for other in infos):
                 self.fail(".step() returns the same info dict twice; return a new one each time")
             if not np.array_equal(given, action):
@@ -125,7 +127,7 @@ class _Check:
 
     def observation(self, method: str, obs: Any) -> None:
         """Check an observation that `method` returned."""
-        wanted = f"an observation is a NumPy array of float64 and shape ({self.robot.obs_dim},)"
+        wanted = f"an observation must be a NumPy array of float64 and shape ({self.robot.obs_dim},)"
         if not isinstance(obs, np.ndarray):
             self.fail(f".{method}() returns a {type(obs).__name__} as the observation; {wanted}")
         if obs.shape != (self.robot.obs_dim,):
@@ -171,7 +173,7 @@ class _Check:
         why = "two robots given the same random numbers and actions differ; draw all random numbers from reset's rng"
         self.compare(first, again, why)
         again = [self.begin(spoilt, spoil=True), *self.play(spoilt, self.actions, spoil=True)]
-        why = "it keeps arrays that it returned or was given, whose caller may write into them; copy them"
+        why = "it keeps arrays that it returned or was given, but callers may write into them; copy them"
         self.compare(first, again, why)
         again = [self.begin(beside)]
         self.begin(other, seed=1)
@@ -191,7 +193,7 @@ class _Check:
             self.begin(machine, seed)
             self.play(machine, [np.sign(action) for action in self.actions])
         again = [self.begin(machine), *self.play(machine, self.actions)]
-        self.compare(first, again, "an episode depends on earlier ones; reset() has to set everything back")
+        self.compare(first, again, "an episode depends on earlier ones; reset() must reset the whole state")
         machine.close()
 
     def states(self, first: list[Step]) -> None:
@@ -209,7 +211,7 @@ class _Check:
             self.play(machine, self.actions[:at])
             state = self.call("get_state", machine.get_state)
             if not isinstance(state, np.ndarray) or state.ndim != 1 or state.dtype != np.float64:
-                self.fail(f".get_state() returns {state!r}; it returns a NumPy array (k,) of float64, at every step")
+                self.fail(f".get_state() returns {state!r}; it must always return a NumPy array (k,) of float64")
             copy = state.copy()
             self.play(machine, self.actions[at:])
             machine.get_state()
@@ -224,7 +226,7 @@ class _Check:
                 self.compare(
                     first[at:],
                     [(obs, *first[at][1:]), *self.play(target, self.actions[at:])],
-                    f"from the state of step {at}, an episode goes on differently; get_state() leaves something out",
+                    f"an episode continues differently from the saved state of step {at}; get_state() omits something",
                 )
             fresh.close()
         machine.close(), used.close()

@@ -54,9 +54,7 @@ def make_robot(name: str, task: Task, simulator: str | None = None) -> Robot:
     if simulator is None:
         return robot()
     if simulator not in robot.simulators:
-        choices = (
-            f"choices: {' '.join(robot.simulators)}" if robot.simulators else "its robot has no choice of simulators"
-        )
+        choices = f"choices: {', '.join(robot.simulators)}" if robot.simulators else "its robot has only one simulator"
         raise UnavailableError(f"unknown simulator {simulator!r} for {name} ({choices})")
     module, _, name = robot.simulators[simulator].partition(":")
     return getattr(importlib.import_module(module), name)()
@@ -74,7 +72,7 @@ def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.nda
     environment has been stepped then.
     """
     if len(set(map(id, envs))) < len(envs) or any(env.constraint is not envs[0].constraint for env in envs):
-        raise ValueError("step_together() takes different environments of one constraint")
+        raise ValueError("step_together() needs different environments with the same constraint")
     if _all_well_formed(envs, actions):
         outcomes: list[Any] = [*actions]
     else:
@@ -137,14 +135,14 @@ class ActionConstrainedEnv(gymnasium.Env):
         self._definition = find_task(task)
         self.constraint = self._definition.constraint
         if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"unknown render_mode {render_mode!r} (choices: None 'rgb_array')")
+            raise ValueError(f"unknown render_mode {render_mode!r} (choices: None, 'rgb_array')")
         if show_set and self.constraint.dim != 2:
             raise ValueError(
                 f"show_set=True needs a two-dimensional action; {task} has {self.constraint.dim} dimensions"
             )
         self._dtype = np.dtype(dtype)
         if self._dtype not in (np.float64, np.float32):
-            raise ValueError(f"unknown dtype {dtype!r} of observations (choices: float64 float32)")
+            raise ValueError(f"unknown dtype {dtype!r} of observations (choices: float64, float32)")
         self.task, self.project, self.render_mode, self.show_set = task, project, render_mode, show_set
         self._simulator = simulator
         self.robot = make_robot(task, self._definition, simulator)

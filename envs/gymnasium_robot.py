@@ -47,7 +47,7 @@ class _Wrapped(Robot):
         if truncated and not terminated and len(self._actions) < self.max_episode_steps:
             raise RuntimeError(
                 f"{self.identifier} truncates an episode after {len(self._actions)} steps, before its time limit of"
-                f" {self.max_episode_steps}; a robot's episode is truncated by the time limit alone"
+                f" {self.max_episode_steps}; only the time limit may truncate a robot's episode"
             )
         return np.array(obs, np.float64).ravel(), float(reward), bool(terminated), dict(info)
 
@@ -69,7 +69,7 @@ class _Wrapped(Robot):
     def render(self) -> np.ndarray:
         """The environment's own picture (h, w, 3), uint8. Raises RuntimeError for one without pictures."""
         if self.render_mode is None:
-            raise RuntimeError(f"{self.identifier} makes no pictures (it has no render mode 'rgb_array')")
+            raise RuntimeError(f"{self.identifier} cannot be rendered (it has no render mode 'rgb_array')")
         return cast(np.ndarray, self.env.render())
 
     def close(self) -> None:

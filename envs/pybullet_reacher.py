@@ -51,7 +51,7 @@ class PyBulletReacher(SimulatedRobot):
             python = f"{sys.version_info.major}.{sys.version_info.minor}"
             raise UnavailableError(
                 "simulator 'pybullet' needs the package pybullet, which has wheels for Linux on x86-64 with Python up"
-                f" to 3.11 (this is Python {python}); the default simulator gives the same joint angles in every bit"
+                f" to 3.11 (this is Python {python}); the default simulator gives bit-identical joint angles"
             ) from None
         self._bullet = bullet = pybullet
         client = bullet.connect(bullet.DIRECT)

@@ -37,17 +37,17 @@ class Task:
         robot, constraint, steps = self.robot, self.constraint, self.steps
         check_class(robot)
         if not isinstance(constraint, Constraint):
-            raise TypeError(f"a task's constraint is an object of a constraints.Constraint, got {constraint!r}")
+            raise TypeError(f"a task's constraint must be an instance of constraints.Constraint, got {constraint!r}")
         if constraint.dim != robot.action_dim:
             raise ValueError(
                 f"the constraint is for {constraint.dim} action coordinates,"
-                f" the robot {robot.__name__} has {robot.action_dim}"
+                f" but the robot {robot.__name__} has {robot.action_dim}"
             )
         for name in ("description", "formula"):
             if not isinstance(getattr(self, name), str):
-                raise TypeError(f"a task's {name} is text, got {getattr(self, name)!r}")
+                raise TypeError(f"a task's {name} must be text, got {getattr(self, name)!r}")
         if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
-            raise ValueError(f"a task's steps are a whole number from 1 on, got {steps!r}")
+            raise ValueError(f"a task's steps must be a whole number of at least 1, got {steps!r}")
 
     def __copy__(self) -> Task:
         return self
@@ -85,17 +85,17 @@ class Tasks(NameTable[Task]):
     def __setitem__(self, name: str, task: Task) -> None:
         if not isinstance(name, str) or not re.fullmatch(r"[^\W_][\w+.-]*", name) or name.lower() in _NOT_NAMES:
             raise ValueError(
-                f"bad name of a task {name!r}: expected letters, digits and + - _ . with a letter or a digit first,"
+                f"bad name {name!r} for a task: expected letters, digits and + - _ . with a letter or a digit first,"
                 f" and none of {', '.join(sorted(_NOT_NAMES))}"
             )
         if not isinstance(task, Task):
-            raise TypeError(f"the row {name} of envs.TASKS is an envs.Task, got {task!r}")
+            raise TypeError(f"the row {name} of envs.TASKS must be an envs.Task, got {task!r}")
         self.check_free(name)
         identifier = gymnasium_id(name)
         before = gymnasium.registry.get(identifier)
         if before is not None and before.kwargs.get("task") != name:
             other = next((other for other in self if gymnasium_id(other) == identifier), "another package")
-            raise ValueError(f"the task {name} would have the identifier {identifier}, which {other} has already")
+            raise ValueError(f"the task {name} needs the identifier {identifier}, which {other} has already")
         gymnasium.registry.pop(identifier, None)  # the same row, if its module is loaded a second time
         gymnasium.register(
             identifier,

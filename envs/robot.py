@@ -76,7 +76,7 @@ class Robot(ABC):
 
     def set_state(self, state: np.ndarray) -> np.ndarray:
         """Continue from `state` (k,) of `get_state`, maybe of another process; return its observation (obs_dim,)."""
-        raise TypeError(f"{type(self).__name__} has no state to set")
+        raise TypeError(f"{type(self).__name__} does not define set_state()")
 
     @abstractmethod
     def render(self) -> np.ndarray:

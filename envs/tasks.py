@@ -107,7 +107,7 @@ _PAPER = {
     "R+T": Task(
         Reacher,
         PlanarEllipse(_tip_matrix, 0.05),
-        "squared length of the sum of two vectors, a_1 and a_1 + a_2 long and theta_2 apart, at most 0.05",
+        "squared length of the sum of two vectors of lengths a_1 and a_1 + a_2 at the angle theta_2, at most 0.05",
         r"a_1^2 + 2 a_1 (a_1 + a_2) \cos\theta_2 + (a_1 + a_2)^2 \leq 0.05",
         REACHER_STEPS,
     ),

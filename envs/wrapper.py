@@ -70,7 +70,7 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         )
         super().__init__(env)
         if not isinstance(constraint, Constraint):
-            raise TypeError(f"the constraint is an object of a constraints.Constraint, got {constraint!r}")
+            raise TypeError(f"constraint must be an instance of constraints.Constraint, got {constraint!r}")
         if mapping is not None:
             known_name("mapping", mapping, MAPPINGS)
         if features is None:
@@ -153,7 +153,7 @@ def _checked_box(space: gymnasium.Space, dim: int) -> gymnasium.spaces.Box:
     if not space.is_bounded():
         raise ValueError(f"the action space must be bounded, got {space}")
     if space.shape != (dim,):
-        raise ValueError(f"the constraint has {dim} action coordinates, the action space has shape {space.shape}")
+        raise ValueError(f"the constraint has {dim} action coordinates, but the action space has shape {space.shape}")
     return space
 
 
@@ -161,6 +161,6 @@ def _check_observations(space: gymnasium.Space) -> None:
     """Raise ValueError for observations that a constraint cannot see without `features`."""
     if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
         raise ValueError(
-            f"observations must be flat arrays, got {space}; features= makes of one the array (n,) that the constraint"
-            " sees"
+            f"observations must be flat arrays, got {space}; pass features=, which turns an observation into the array"
+            " (n,) that the constraint sees"
         )

@@ -120,8 +120,8 @@ def improvement_table(aggregates: Sequence[Aggregates]) -> Table:
             rows.append(cells)
         sections.append(rows)
     title = (
-        "Probability of improvement: that a run of the row's algorithm is better than one of the column's, "
-        f"mean over their common tasks; bold where its {INTERVAL} is above 0.5{all_with(shared)}"
+        "Probability of improvement: a run of the row's algorithm is better than a run of the column's algorithm, "
+        f"mean over their common tasks; bold if the {INTERVAL} is above 0.5{all_with(shared)}"
     )
     return Table("improvement", title, ["Settings", "Algorithm", *algos], 2, sections, records)
 

@@ -193,7 +193,7 @@ def list_diverged(groups: Groups) -> list[str]:
             if count := count_diverged(runs):
                 diverged = [run for run in runs if run.failure and math.isfinite(final_return(run))]
                 which = "; ".join(f"seed {run.seed} {describe_failure(run.failure)}" for run in diverged)
-                said = f"{count} of {len(runs)} seeds diverged; best parameters before"
+                said = f"{count} of {len(runs)} seeds diverged and count with their best parameters before"
                 lines.append(f"{condition.label} {algo}: {said}: {which}")
     return lines
 

@@ -112,7 +112,9 @@ def play(run: Run) -> Episode:
     missing, damaged or of another shape, or if the environment refuses an action or the constraint fails.
     """
     if run.task not in envs.TASKS or run.algo not in ALGORITHMS:
-        raise ConfigError(f"{run.folder}: {run.algo} on {run.task} is not of this project{missing_plugin(run.folder)}")
+        raise ConfigError(
+            f"{run.folder}: unknown algorithm or task, {run.algo} on {run.task}{missing_plugin(run.folder)}"
+        )
     env = envs.make(run.task)
     try:
         config = replace(saved_config(run.config), device="cpu")
@@ -130,7 +132,7 @@ def play(run: Run) -> Episode:
             action = policy(obs)
             next_obs, reward, terminated, truncated, _ = env.step(action)
         except (envs.InfeasibleActionError, ConstraintError) as error:
-            raise ConfigError(f"{run.folder}: the episode ends at step {len(steps) + 1}: {error}") from error
+            raise ConfigError(f"{run.folder}: the episode fails at step {len(steps) + 1}: {error}") from error
         steps.append((obs, action, reward))
         obs, done = next_obs, terminated or truncated
     env.close()
@@ -154,7 +156,7 @@ def draw_actions(folder: Path, out: Path, formats: Sequence[str]) -> list[Path]:
         raise ConfigError(f"{folder}: unknown task {run.task!r}{missing_plugin(folder)}")
     if run.task not in planar:
         raise ConfigError(
-            f"{folder}: {run.task} is no task of two dimensions (choices: {', '.join(order_tasks(planar))})"
+            f"{folder}: {run.task} does not have two-dimensional actions (choices: {', '.join(order_tasks(planar))})"
         )
     episode = play(run)
     constraint = envs.constraint(run.task)

@@ -59,11 +59,11 @@ def parse_sources(words: Sequence[str]) -> list[Source]:
             label = path.resolve().stem if path.is_file() else path.resolve().name
         if label is not None and (label == RESERVED or not re.fullmatch(r"[^\s()]([^()]*[^\s()])?", label)):
             raise ConfigError(
-                f"bad label {label!r} of {path}: expected PATH=LABEL, the label a few letters without brackets, other"
-                f" than {RESERVED!r}"
+                f"bad label {label!r} for {path}: expected PATH=LABEL with a label that has no brackets and is not"
+                f" {RESERVED!r}"
             )
         if label and label in (source.label for source in sources):
-            raise ConfigError(f"two folders have the label {label!r}: give {path} another one, as {path}=LABEL")
+            raise ConfigError(f"two folders have the label {label!r}: give {path} another one with {path}=LABEL")
         sources.append(Source(path, label or ""))
     return sources
 
@@ -135,7 +135,7 @@ def _parse(row: dict[str, str | None], line: int) -> tuple[str, str, int, int, f
             raise ValueError(f"line {line}: {name} is empty")
     for name, text in zip(COLUMNS[2:4], numbers[:2], strict=True):
         if not re.fullmatch(r"\d{1,15}", text, re.ASCII):
-            raise ValueError(f"line {line}: bad value {text!r} for {name}: expected a whole number from 0 on")
+            raise ValueError(f"line {line}: bad value {text!r} for {name}: expected a whole number of at least 0")
     try:
         value = float(numbers[2])
     except ValueError:

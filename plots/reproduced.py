@@ -134,4 +134,4 @@ def replace_table(text: str, table: str) -> str:
 if __name__ == "__main__":
     for path, make in TABLES.items():
         path.write_text(replace_table(path.read_text(), make(read_cells(DATA))))
-        print(f"the table of {path.relative_to(ROOT)} is that of docs/data")
+        print(f"the table of {path.relative_to(ROOT)} is now made from docs/data")

@@ -165,7 +165,7 @@ def comparison_table(groups: Groups) -> Table:
                 records.append(record)
         if rows:
             sections.append(rows)
-    title = "Comparison with the paper; the difference, not adjusted for starts, also in joint standard errors"
+    title = "Comparison with the paper; differences are not adjusted for starts (last column: in joint standard errors)"
     title += all_with(shared)
     if all(record["paper_mean"] is None for record in records):
         sections, records = [], []

@@ -162,8 +162,8 @@ class CheckpointFolder:
                 content = load_tensors(path)
                 if content.get("format") != FORMAT:
                     raise FormatError(
-                        f"{path} was written by another version of this code, and this one cannot resume from it;"
-                        " overwrite=true starts the run again and keeps the old one, seed= can leave it out"
+                        f"{path} was written by another version of this code, and this version cannot resume it;"
+                        " overwrite=true starts the run again and keeps the old one; or leave out its seed in seed="
                     )
                 files = tuple(ReplayFile(*file) for file in content["replay_files"])
                 for file in files:

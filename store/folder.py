@@ -73,7 +73,9 @@ def run_folder(root: str | Path, task: str, variant: str, seed: int) -> Path:
     """`root/task/variant/seed=<seed>`. Raises ValueError if a name cannot be a folder's."""
     for name in (task, variant):
         if not name or name.startswith(".") or "/" in name or os.sep in name:
-            raise ValueError(f"{name!r} cannot name a run's folder: empty, or with a leading '.' or a '/'")
+            raise ValueError(
+                f"bad name {name!r} for a run's folder: it must not be empty, begin with '.' or contain '/'"
+            )
     return user_path(root) / task / variant / f"seed={seed}"
 
 

@@ -75,7 +75,7 @@ def _acquire(path: Path, run_folder: Path) -> int | None:
         if held:
             raise LockedError(f"{run_folder} is being trained by {name}")
         if owner and owner["host"] != here and not _job_is_over(owner):
-            raise LockedError(f"{run_folder} is being trained by {name}; if that has ended, delete {path}")
+            raise LockedError(f"{run_folder} is being trained by {name}; if that process has ended, delete {path}")
         # Another host may have taken the file over while Slurm answered.
         unchanged = _read_owner(file) == owner
         if unchanged and path.exists() and os.path.samestat(os.stat(path), os.fstat(file)):

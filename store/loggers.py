@@ -178,7 +178,7 @@ class Loggers:
         self.names.remove(name)
         self.open.pop(name, None)
         print(
-            f"{self.folder}: log={name} ends after step {self.last[0]}: {one_line(error) or type(error).__name__}"
-            " (the training goes on, and the run's own files have everything)",
+            f"{self.folder}: log={name} stops after step {self.last[0]}: {one_line(error) or type(error).__name__}"
+            " (the training continues, and the run's own files are complete)",
             file=sys.stderr,
         )

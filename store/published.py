@@ -98,6 +98,8 @@ def write_published(folder: str | Path, runs: Iterable[PublishedRun]) -> None:
     _write_table(folder / EVALUATIONS, [row for run in runs for row in _evaluation_rows(run)])
     if training := [row for run in runs for row in _training_rows(run)]:
         _write_table(folder / TRAINING, training)
+    else:
+        (folder / TRAINING).unlink(missing_ok=True)
     _write_table(folder / RUNS, [run.row() for run in runs])
 
 
@@ -191,7 +193,7 @@ def _read_table(path: Path) -> list[dict[str, str]]:
         rows = list(csv.DictReader(io.StringIO(text.decode(), newline="")))
         for number, row in enumerate(rows, 1):
             if None in row or None in row.values():
-                raise ValueError(f"row {number} has not as many fields as the header")
+                raise ValueError(f"row {number} does not have as many fields as the header")
             _key(row)
     return rows
 

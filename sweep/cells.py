@@ -97,7 +97,9 @@ class Cell(CellFolders):
         changed = differences(config, paper)
         for key, value in changed.items():
             if "/" in str(value):
-                raise ConfigError(f"bad value {value!r} for {key}: it names the run's folder, which cannot have a '/'")
+                raise ConfigError(
+                    f"bad value {value!r} for {key}: it is part of the run's folder name, so it cannot have a '/'"
+                )
         return cls(
             root=user_path(config.results),
             task=config.env,

@@ -55,10 +55,10 @@ def _check_projection(task: str, constraint: Constraint, action_dim: int, obs: T
     """Raise ConfigError if the constraint does not fit the robot or its projection fails at obs (1, n)."""
     try:
         if constraint.dim != action_dim:
-            raise ValueError(f"it is for {constraint.dim} action coordinates, the robot has {action_dim}")
+            raise ValueError(f"it is for {constraint.dim} action coordinates, but the robot has {action_dim}")
         action = constraint.project(obs, torch.ones(1, constraint.dim))
         if action.shape != (1, constraint.dim) or not _is_allowed(constraint, obs, action):
-            raise ValueError(f"it projects (1, ..., 1) to {action.tolist()} at a first observation")
+            raise ValueError(f"it projects (1, ..., 1) to {action.tolist()}, which is not a feasible action")
     except Exception as error:  # the constraint may be the user's own code
         raise ConfigError(f"the constraint of {task} does not work: {one_line(error)}") from error
 
@@ -76,7 +76,9 @@ def _named(task: str, constraint: Constraint) -> Constraint:
 
 def _reporting(task: str, constraint: Constraint, name: str, method: Callable) -> Callable:
     def refuse(obs: Tensor, said: str) -> ConfigError:
-        return ConfigError(f"the constraint of {task} does not work: {name} at observations {_shape(obs)}: {said}")
+        return ConfigError(
+            f"the constraint of {task} does not work: {name} at observations of shape {_shape(obs)}: {said}"
+        )
 
     @wraps(method)
     def reporting(*args: Any, **kwargs: Any) -> Any:
@@ -149,7 +151,9 @@ def _check_map(config: Config, agent: Agent, obs: Tensor) -> None:
             sample = Sample(suggested, 0.5 * suggested, ones, suggested.sum(-1))
             mapped["with_log_prob"], log_prob = agent.map.with_log_prob(constraint, obs, sample, center)
             if log_prob.shape != obs.shape[:-1] or not log_prob.isfinite().all():
-                raise ValueError(f"with_log_prob gives log-densities {_shape(log_prob)}: {log_prob.tolist()}")
+                raise ValueError(
+                    f"with_log_prob returns {log_prob.tolist()}, not finite numbers of shape {tuple(obs.shape[:-1])}"
+                )
         for method, action in mapped.items():
             _check_actions(config, f"the map {name}, {method}", agent, obs, action)
             if agent.placement == "layer" and method != "pull_back":
@@ -159,17 +163,22 @@ def _check_map(config: Config, agent: Agent, obs: Tensor) -> None:
     except ConfigError:
         raise
     except Exception as error:  # the map may be the user's own code
-        said = f"{one_line(error)} (observations {_shape(obs)})"
+        said = f"{one_line(error)} (at observations of shape {_shape(obs)})"
         raise ConfigError(f"the map {name} does not work on {config.env}: {said}") from error
 
 
 def _check_actions(config: Config, what: str, agent: Agent, obs: Tensor, action: Tensor) -> None:
     """Raise ConfigError if actions (..., d) have a wrong shape or are infeasible at obs (..., n)."""
     if action.shape != (*obs.shape[:-1], agent.action_dim):
-        raise ConfigError(f"{config.algo} on {config.env}: {what} gives actions {_shape(action)} at {_shape(obs)}")
+        raise ConfigError(
+            f"{config.algo} on {config.env}: {what} gives actions of shape {_shape(action)} for observations of shape"
+            f" {_shape(obs)}"
+        )
     if not _is_allowed(agent.constraint, obs, action.detach()):
         violation = agent.constraint.violation(obs, action.detach()).max().item()
-        raise ConfigError(f"{config.algo} on {config.env}: {what} gives an action that violates it by {violation:.3g}")
+        raise ConfigError(
+            f"{config.algo} on {config.env}: {what} gives an action that violates the constraint by {violation:.3g}"
+        )
 
 
 def _check_saving(what: str, state: Callable[[], Any]) -> None:

@@ -43,14 +43,14 @@ def changed_runs(folders: Iterable[Path], now: Mapping[str, Description]) -> dic
             continue
         if read_definition(folder) is None:
             if not all(map(is_own, now.values())):
-                found[folder] = "does not tell on which definition of its task and algorithm it was trained"
+                found[folder] = "has no readable definition.json, so its task or algorithm may have changed"
         elif changed := changes(folder, now):
-            found[folder] = f"was trained on {changed}"
+            found[folder] = f"was trained with {changed}"
     return found
 
 
 def refuse(changed: Mapping[Path, str]) -> NoReturn:
     """Raise ConfigError for runs of another definition, `changed`, as the command does not say what to do with them."""
     (folder, said), *others = changed.items()
-    more = f" (so it is for {len(others)} more)" if others else ""
+    more = f" (the same holds for {len(others)} more)" if others else ""
     raise ConfigError(f"{folder} {said}{more}; overwrite=changed starts such runs again and keeps the old ones")

@@ -146,7 +146,7 @@ def flow_of(
             raise ConfigError(f"the flow of {config.env} cannot be trained: {one_line(error)}{hint}") from error
     accuracy, recall = (trained["measures"][name] for name in ("accuracy", "recall"))
     if accuracy < GOOD:
-        _note(f"the flow of {config.env} takes {100 * accuracy:.1f} % of the box into the set; the rest is projected")
+        _note(f"the flow of {config.env} maps {100 * accuracy:.1f} % of the box into the set; the rest is projected")
     if recall < WIDE:
         _note(f"the flow of {config.env} reaches {100 * recall:.1f} % of the set; no policy can use the rest")
     return trained

@@ -40,13 +40,13 @@ def launch(sweep: Sweep, cells: Sequence[Cell], stop_if_asked: Callable[[], None
         for task, simulator in {(cell.task, cell.config.simulator) for cell in cells if cell.config.simulator}:
             make_env(task, simulator).close()  # if it is not installed, no cell should start
     elif settings.overwrite == "true":
-        raise ConfigError("overwrite=true does not go with launcher=slurm: each requeue would start the cell again")
+        raise ConfigError("overwrite=true cannot be used with launcher=slurm: each requeue would start the cell again")
     else:
         check_gpus(sweep, settings.device)
     for cell in cells:
         if len(os.fsencode(cell.record("log").name)) > LONGEST_NAME:
             raise ConfigError(
-                f"seed={format_seeds(cell.seeds)} is too long for the name of a log: take seeds without gaps, or"
+                f"seed={format_seeds(cell.seeds)} is too long for the name of a log: use seeds without gaps, or"
                 " several commands"
             )
     if settings.overwrite == "false" and (changed := find_changed(cells)):

@@ -105,7 +105,7 @@ def run_queue(entries: Sequence[Entry], jobs: int, stop_if_asked: Callable[[], N
                         stop_if_asked()
                 except Interrupted as error:
                     interrupted = error
-                    display.say("interrupted: waiting for checkpoints (a second time ends without them)")
+                    display.say("interrupted: waiting for checkpoints (interrupt again to end without them)")
                     queue.stop()
         except BaseException:
             queue.stop()

@@ -97,8 +97,8 @@ def describe_plan(entries: Sequence[Entry], jobs: int) -> str:
         jobs, unknown = min(jobs, len(left)), len(left) - len(work)
         if unknown:
             lines.append(
-                f"note: the time of {unknown} cell{'s' * (unknown > 1)} is unknown, as nothing like that was measured;"
-                " once a run of it has finished in this folder, that tells"
+                f"note: the time of {unknown} cell{'s' * (unknown > 1)} is unknown: nothing similar was measured;"
+                " it is known once such a run has finished in this folder"
             )
         if left[0].cell.config.device != "cpu":
             lines.append("note: the estimates are for the CPU; GPUs are not measured")
@@ -108,7 +108,7 @@ def describe_plan(entries: Sequence[Entry], jobs: int) -> str:
         lines.append(
             f"estimate{' without these' if unknown else ''}: {estimates.in_words(sum(work))} on one core in all;"
             f" {estimates.in_words(estimates.makespan(work, jobs))} with {jobs} cell{'s' * (jobs > 1)} at a time,"
-            f" on a core each, in up to {memory / 1e9:.1f} GB of memory"
+            f" one core each, in up to {memory / 1e9:.1f} GB of memory"
         )
     return "\n".join(lines)
 
@@ -125,7 +125,7 @@ def memory_warning(entries: Sequence[Entry], jobs: int) -> str:
     needed = _largest_memory(entries, jobs)
     if needed <= there:
         return ""
-    return f"note: {jobs} cells at a time may need {needed / 1e9:.0f} GB of memory, and there are {there / 1e9:.0f}"
+    return f"note: {jobs} cells at a time may need {needed / 1e9:.0f} GB of memory; this machine has {there / 1e9:.0f}"
 
 
 def _largest_memory(entries: Sequence[Entry], jobs: int) -> float:

@@ -48,7 +48,7 @@ def plugin_words() -> list[str]:
 def refuse_to_train_in_plugin() -> None:
     """Raise ConfigError while a plugin is being imported."""
     if not all(_loaded.values()):
-        raise ConfigError('a plugin only registers: train below `if __name__ == "__main__":`')
+        raise ConfigError('a plugin must not train when it is imported: train below `if __name__ == "__main__":`')
 
 
 def _load(path: Path) -> None:
@@ -60,7 +60,7 @@ def _load(path: Path) -> None:
     name = path.stem
     spec = importlib.util.find_spec(name) if name.isidentifier() else None
     if name in sys.modules or (spec and (not spec.origin or Path(spec.origin).resolve() != path.resolve())):
-        raise ConfigError(f"{KEY} {path} has the name of another module, {name}: rename it")
+        raise ConfigError(f"{KEY} {path} has the same name as another module, {name}: rename it")
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec and spec.loader  # it has the suffix .py
     module = importlib.util.module_from_spec(spec)

@@ -63,7 +63,7 @@ class Display:
         self.seconds, self.estimated = self.seconds + end.seconds, self.estimated + entry.remaining
         if end.code == Exit.DIVERGED:
             self.diverged.append(entry)
-        how = "finished, a seed diverged" if end.code == Exit.DIVERGED else "finished"
+        how = "finished (a seed diverged)" if end.code == Exit.DIVERGED else "finished"
         self.say(f"{entry.cell.name}: {how} after {in_words(end.seconds)} ({len(self.done)} of {len(self.entries)})")
 
     def show(self, running: Mapping[Entry, float]) -> None:

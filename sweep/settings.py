@@ -21,18 +21,20 @@ class SlurmSettings:
     """The resources that each job of a sweep requests from Slurm."""
 
     partition: str | None = field(default=None, metadata={"help": "partition (default: the cluster's)"})
-    gpus: int = field(default=0, metadata={"help": "GPUs a cell"})
-    cpus: int = field(default=1, metadata={"help": "CPUs a cell, and its threads where threads= is not given"})
-    hours: float = field(default=24.0, metadata={"help": "time limit; a longer cell is requeued and resumes"})
-    parallel: int = field(default=256, metadata={"help": "cells running at the same time, at most"})
+    gpus: int = field(default=0, metadata={"help": "GPUs per cell"})
+    cpus: int = field(default=1, metadata={"help": "CPUs per cell, and its threads if threads= is not given"})
+    hours: float = field(
+        default=24.0, metadata={"help": "time limit; a cell that needs longer is requeued and resumes"}
+    )
+    parallel: int = field(default=256, metadata={"help": "most cells that run at the same time"})
 
 
 @dataclass
 class SweepSettings:
     """How the cells of a command are run. Without `jobs`, the local launcher trains them in this process."""
 
-    jobs: int | None = field(default=None, metadata={"help": "cells at the same time, a process each"})
-    launcher: str = field(default="local", metadata={"help": "this machine: 'local'; a job array: 'slurm'"})
+    jobs: int | None = field(default=None, metadata={"help": "cells that run at the same time, one process each"})
+    launcher: str = field(default="local", metadata={"help": "'local' (this machine) or 'slurm' (a job array)"})
     dry: bool = field(default=False, metadata={"help": "only print the plan: states, time, memory"})
 
 
@@ -95,6 +97,6 @@ def _check_values(sweep: Sweep, slurm_keys: Sequence[str]) -> None:
     if 3600 * slurm.hours <= 2 * SIGNAL_DELAY and "signal" not in sweep.sbatch:
         # The signal would come before the training has made progress, again and again.
         raise ConfigError(
-            f"bad value {slurm.hours} for slurm.hours: must be more than {2 * SIGNAL_DELAY} seconds, as a cell writes"
-            f" its checkpoint {SIGNAL_DELAY} seconds before the end, unless slurm.signal= says otherwise"
+            f"bad value {slurm.hours} for slurm.hours: must be more than {2 * SIGNAL_DELAY} seconds, because a cell"
+            f" writes its checkpoint {SIGNAL_DELAY} seconds before the end; slurm.signal= can change this"
         )

@@ -60,7 +60,7 @@ def check_gpus(sweep: Sweep, device: str) -> None:
         raise ConfigError(f"device={device} with launcher=slurm needs slurm.gpus= of at least 1")
     if ":" in device:
         raise ConfigError(
-            f"device={device} does not go with launcher=slurm: a job sees its own GPUs alone (device=cuda)"
+            f"device={device} cannot be used with launcher=slurm: a job sees only its own GPUs (use device=cuda)"
         )
     if device == "cpu" and gpus:
         raise ConfigError(f"slurm.gpus={gpus} needs device=cuda: with device=cpu, the cells would not use them")
@@ -84,7 +84,7 @@ def submit(sweep: Sweep, cells: Sequence[Cell]) -> None:
         with run_lock(folder.with_name("submission")):
             jobs = job_states(cells)
             if NO_ANSWER in jobs.values():
-                raise ConfigError("squeue does not answer, so it is unknown which cells are queued already")
+                raise ConfigError("squeue does not answer, so cells may be queued already; try again later")
             entries = make_plan(cells, jobs)
             print(count_states([entry.state for entry in entries]))
             for entry in entries:
@@ -98,12 +98,12 @@ def submit(sweep: Sweep, cells: Sequence[Cell]) -> None:
             executor.update_parameters(**_parameters(sweep, free))
             submitted = _submit(executor, free, sweep.sbatch.get("clusters"))
     except LockedError as error:
-        raise ConfigError(f"another command submits cells of {folder.parents[1]} at this moment: {error}") from None
+        raise ConfigError(f"another command is submitting cells of {folder.parents[1]}: {error}") from None
     except submitit.core.utils.FailedJobError as error:
         raise _explain(error) from error
     array = submitted[0].job_id.partition("_")[0]
-    print(f"submitted {len(free)} as job {array} (`scancel {array}` ends it; logs in {folder})")
-    print(f"`python run.py status {folder.parents[1]}` shows how all cells stand")
+    print(f"submitted {len(free)} as job {array} (`scancel {array}` cancels it; logs in {folder})")
+    print(f"`python run.py status {folder.parents[1]}` shows the state of all cells")
 
 
 def _submit(executor: Any, free: Sequence[Entry], clusters: str | None) -> list[Any]:
@@ -195,7 +195,7 @@ class Job:
         if code > 128 and _is_running(environment.job_id):
             # SIGTERM, with which Slurm preempts, may come at any moment; the other signal comes near the time limit.
             if code == 128 + signum and self._progress() == before:
-                reason = "not requeued: no checkpoint between the start of the job and Slurm's signal (slurm.hours?)"
+                reason = "not requeued: the job wrote no new checkpoint before Slurm's signal (slurm.hours too short?)"
                 self.cell.note_end(code, log, reason)
             else:
                 try:

@@ -48,7 +48,7 @@ def describe_status(words: Sequence[str]) -> str:
     states = [state_of(cell, jobs) for cell in cells]
     lines = [_table(cells, states), count_states(states), *list_details(cells, states)]
     if NO_ANSWER in jobs.values():
-        lines.append("(squeue does not answer: which jobs are queued or running on the cluster is unknown)")
+        lines.append("(squeue does not answer: jobs may be queued or running on the cluster)")
     return "\n".join(lines)
 
 

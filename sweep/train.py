@@ -255,10 +255,10 @@ def _resume(
         if seed not in ended:
             print(f"{folders[seed]}: resuming from step {group[seed].step}")
     if len(seeds) < len(before):
-        print(f"(trained with other seeds before, {len(before)} in all: equal up to rounding to an unbroken run)")
+        print(f"(before, {len(before)} seeds were trained together: equal to an uninterrupted run only up to rounding)")
     for key, now in (("threads", config.threads), ("device", config.device)):
         if (earlier := group[seeds[0]].settings[key]) != now:
-            print(f"({key}={now} now, {earlier} before: equal up to rounding to an unbroken run)")
+            print(f"({key}={now} now, {earlier} before: equal to an uninterrupted run only up to rounding)")
     trainer = make_trainer(config, seeds, writers, True, stop_if_asked)
     trainer.restore([group[seed] for seed in seeds])
     _run(trainer)
@@ -296,7 +296,7 @@ def _run(trainer: Trainer) -> None:
             print(
                 f"{folder}: return {result['return_mean']:.2f} over {len(result['returns'])} episodes"
                 f" (parameters of step {result['best_step']}; largest violation {result['largest_violation']:.1e}"
-                f"{'; quick=true, for comparison too few' if trainer.config.quick else ''})"
+                f"{'; quick=true: too few to compare' if trainer.config.quick else ''})"
             )
 
 

@@ -82,13 +82,13 @@ def test_what_a_captured_step_cannot_do_is_an_error():
     kinds = KINDS["two kinds"]
     ahead = ahead_of(Streams(SEEDS, "update"), kinds)
     ahead.ahead.begin(0)
-    with pytest.raises(RuntimeError, match="take turns"):
+    with pytest.raises(RuntimeError, match="do not alternate"):
         ahead.ahead.begin(0)
     ahead.ahead.read(0)
-    with pytest.raises(RuntimeError, match="did not"):
+    with pytest.raises(RuntimeError, match="unlike the step before"):
         ahead.uniform(16)
     with pytest.raises(ValueError, match="for all seeds"):
         ahead.normal(16, which=[0])
     ahead.normal(16)
-    with pytest.raises(RuntimeError, match="did not"):
+    with pytest.raises(RuntimeError, match="unlike the step before"):
         ahead.normal(16)

@@ -98,7 +98,7 @@ def file_in_place_of_the_variant(root):
 @pytest.mark.parametrize(
     "prepare, said",
     [
-        (lock_of_another_host, "by process 12 on elsewhere; if that has ended, delete "),
+        (lock_of_another_host, "by process 12 on elsewhere; if that process has ended, delete "),
         (folder_in_place_of_the_lock, "is a directory"),
         (file_in_place_of_the_task, "R+N"),
         (file_in_place_of_the_variant, VARIANT),

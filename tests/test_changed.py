@@ -100,7 +100,7 @@ def test_the_plan_of_a_sweep_starts_changed_cells_again(tmp_path, set_bound, cap
     train_cells(cells_of(words))
     set_bound(0.9)
     assert run_command([*words.split(), "jobs=2"]) == 2
-    assert "(so it is for 3 more); overwrite=changed" in capsys.readouterr().err
+    assert "(the same holds for 3 more); overwrite=changed" in capsys.readouterr().err
     stages = {(e.cell.task, e.state.stage) for e in make_plan(cells_of(f"{words} overwrite=changed"), {})}
     assert stages == {("R+X", Stage.NEW), ("R+L2", Stage.FINISHED)}
     assert run_command([*words.split(), "jobs=2", "overwrite=changed", "dry=true"]) == 0
@@ -164,7 +164,7 @@ def test_play_notes_a_changed_definition_in_one_line(tmp_path, set_bound, capsys
     assert run_command(["play", str(folder), "episodes=1"]) == 0
     captured = capsys.readouterr()
     assert captured.err == (
-        f"note: {folder} was trained on another definition of its task: the constraint's bound: 0.05 then, 0.9 now\n"
+        f"note: {folder} was trained with another definition of its task: the constraint's bound: 0.05 then, 0.9 now\n"
     )
     assert not recwarn
 

@@ -253,7 +253,7 @@ class NoFps(Good):
 MISTAKES = {
     "an info from reset": (
         type("Bad", (Good,), {"reset": lambda self, rng: (Good.reset(self, rng), {})}),
-        "Bad.reset() returns a tuple; it returns the observation alone, without an info",
+        "Bad.reset() returns a tuple; it must return only the observation, without an info",
     ),
     "a list": (with_obs(list), "Bad.reset() returns a list as the observation"),
     "single precision": (with_obs(np.float32), "Bad.reset() returns an observation of float32"),
@@ -262,18 +262,18 @@ MISTAKES = {
     "NaN": (with_obs(lambda o: o * np.nan), "Bad.reset() returns an observation that is not finite"),
     "five values": (
         with_step(lambda o, r, t, i: (o, r, t, False, i)),
-        "returns 5 values; it returns four, (obs, reward",
+        "returns 5 values; it must return four, (obs, reward",
     ),
-    "three values": (with_step(lambda o, r, t, i: (o, r, t)), "Bad.step() returns 3 values; it returns four"),
-    "a list of four": (with_step(lambda *four: list(four)), "Bad.step() returns a list; it returns four"),
+    "three values": (with_step(lambda o, r, t, i: (o, r, t)), "Bad.step() returns 3 values; it must return four"),
+    "a list of four": (with_step(lambda *four: list(four)), "Bad.step() returns a list; it must return four"),
     "single precision in step": (
         with_step(lambda o, r, t, i: (o.astype(np.float32), r, t, i)),
         "Bad.step() returns an observation of float32",
     ),
-    "reward an array": (with_step(lambda o, r, t, i: (o, np.array([r]), t, i)), "it is one finite number"),
-    "reward NaN": (with_step(lambda o, r, t, i: (o, float("nan"), t, i)), "reward nan; it is one finite number"),
-    "terminated a number": (with_step(lambda o, r, t, i: (o, r, 0, i)), "terminated as 0; it is True or False"),
-    "info None": (with_step(lambda o, r, t, i: (o, r, t, None)), "info as None; it is a dict"),
+    "reward an array": (with_step(lambda o, r, t, i: (o, np.array([r]), t, i)), "it must be one finite number"),
+    "reward NaN": (with_step(lambda o, r, t, i: (o, float("nan"), t, i)), "reward nan; it must be one finite number"),
+    "terminated a number": (with_step(lambda o, r, t, i: (o, r, 0, i)), "terminated as 0; it must be True or False"),
+    "info None": (with_step(lambda o, r, t, i: (o, r, t, None)), "info as None; it must be a dict"),
     "obs shared": (SharedObs, "an observation changes at a later step; return a new array"),
     "obs kept": (KeepsObs, "KeepsObs: it keeps arrays that it returned or was given"),
     "action kept": (KeepsAction, "KeepsAction: it keeps arrays that it returned or was given"),
@@ -284,29 +284,32 @@ MISTAKES = {
     "earlier episodes": (Remembers, "Remembers: an episode depends on earlier ones"),
     "number of draws": (DrawsMoreAtFirst, "DrawsMoreAtFirst: an episode depends on earlier ones"),
     "state on the class": (OnTheClass, "OnTheClass: a robot changes when another one steps"),
-    "state incomplete": (Incomplete, "an episode goes on differently; get_state() leaves something out"),
-    "obs of set_state": (WrongObsFromState, "an episode goes on differently"),
+    "state incomplete": (
+        Incomplete,
+        "get_state() omits something",
+    ),
+    "obs of set_state": (WrongObsFromState, "an episode continues differently"),
     "state shared": (SharedState, "the state that get_state() returned changes at a later step"),
-    "state kept": (KeepsState, "goes on differently"),
+    "state kept": (KeepsState, "continues differently"),
     "state not float64": (
         type("Bad", (Good,), {"get_state": lambda self: [self.x, self.v]}),
-        "it returns a NumPy array (k,) of float64, at every step",
+        "it must always return a NumPy array (k,) of float64",
     ),
     "state sometimes None": (
         type("Bad", (Good,), {"get_state": lambda self: self.obs() if self.v == 0 else None}),
-        "it returns a NumPy array (k,) of float64, at every step",
+        "it must always return a NumPy array (k,) of float64",
     ),
-    "get_state alone": (OnlyGetState, "has get_state() alone; get_state() and set_state() belong together"),
-    "set_state alone": (OnlySetState, "has set_state() alone; get_state() and set_state() belong together"),
+    "get_state alone": (OnlyGetState, "defines only get_state(); get_state() and set_state() belong together"),
+    "set_state alone": (OnlySetState, "defines only set_state(); get_state() and set_state() belong together"),
     "together": (Together, "Together.step_together() of 50 robots differs from step()"),
     "together, order": (TogetherOrder, "TogetherOrder.step_together() of 2 robots differs from step()"),
     "close once": (CloseOnce, "CloseOnce.close() fails with AssertionError: closed already"),
     "arguments": (NeedsArguments, "NeedsArguments.__init__() fails with TypeError"),
     "code that fails": (Fails, "Fails.step() fails with AttributeError: 'Fails' object has no attribute 'nothing'"),
-    "no fps": (NoFps, "NoFps.fps is None; it is an attribute of the class, a whole number from 1 on"),
+    "no fps": (NoFps, "NoFps.fps is None; it must be a class attribute, a whole number of at least 1"),
     "fps with a fraction": (type("Bad", (Good,), {"fps": 62.5}), "Bad.fps is 62.5"),
-    "an object": (Good(), "a robot is a class that derives from envs.Robot"),
-    "a Gymnasium class": (gymnasium.Env, "a robot is a class that derives from envs.Robot"),
+    "an object": (Good(), "a robot must be a class that derives from envs.Robot"),
+    "a Gymnasium class": (gymnasium.Env, "a robot must be a class that derives from envs.Robot"),
     "hyperparameters": (type("Bad", (Good,), {"hyperparameters": None}), "Bad.hyperparameters is None"),
 }
 
@@ -453,7 +456,7 @@ def test_limits_and_boxes_that_do_not_fit(strange):
     robot = envs.GymnasiumRobot(strange(max_episode_steps=3))()
     assert robot.reset(np.random.default_rng(0)).shape == (4,)
     assert [robot.step(np.zeros(2))[2] for _ in range(3)] == [False] * 3  # the outer environment truncates
-    with pytest.raises(RuntimeError, match="makes no pictures"):
+    with pytest.raises(RuntimeError, match="cannot be rendered"):
         robot.render()
     robot = envs.GymnasiumRobot(strange(max_episode_steps=10))()
     robot.reset(np.random.default_rng(0))

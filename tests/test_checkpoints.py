@@ -72,7 +72,7 @@ def test_without_a_whole_checkpoint_a_run_starts_again_and_the_old_one_is_kept(t
     train(tmp_path, CHECKPOINTED)
     captured = capsys.readouterr()
     assert captured.err.count("damaged checkpoint: wrong checksum") == 2
-    assert "other seeds before" in captured.out and captured.out.count("resuming") == 1
+    assert "seeds were trained together" in captured.out and captured.out.count("resuming") == 1
     assert f"{second}: resuming" in captured.out
     assert (first.parent / "seed=3.old-1" / "checkpoint").is_dir()
     assert set(outcome(tmp_path)) == {"seed=3", "seed=5"}
@@ -199,7 +199,7 @@ def test_another_grouping_goes_on_from_the_checkpoints_too(tmp_path, capsys, unb
     capsys.readouterr()
     alone = CHECKPOINTED.replace("seed=3,5", "seed=3")
     train(tmp_path, alone)
-    assert f"{folder}: resuming from step" in (out := capsys.readouterr().out) and "equal up to rounding" in out
+    assert f"{folder}: resuming from step" in (out := capsys.readouterr().out) and "only up to rounding" in out
     assert (other / "checkpoint").is_dir() and not (folder / "checkpoint").exists()
     result = results.read_run(folder).result
     assert result["steps"] == 60 and result["gradient_steps"] == unbroken["seed=3"]["result"]["gradient_steps"]

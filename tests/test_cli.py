@@ -65,7 +65,7 @@ def test_usage_names_every_algorithm_task_and_key(capsys, arguments):
         ("algo=SRad env=W+M gamma={", "bad value '{' for gamma: expected float"),
         ("algo=SRad env=W+M steps=1:30", "bad value '1:30' for steps: expected int"),
         ("algo=SRad env=W+M gamma=", "expected key=value"),
-        ("algo=SRad env=W+M train_freq=never", "steps or 'episode'"),
+        ("algo=SRad env=W+M train_freq=never", ">= 1 or 'episode'"),
         ("algo=SRad env=W+M gradient_steps=-2", "-1 or at least 1"),
         ("algo=SRad env=W+M batch_size=null", "a value is needed"),
         ("algo=SRad env=W+M action_noise=0.1", "does not apply to SRad"),

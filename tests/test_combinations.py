@@ -42,7 +42,7 @@ def test_what_is_a_list_of_values(key, text, values):
     [
         ("learning_rate", "1e-3,", "a value between commas is empty"),
         ("tau", ",", "a value between commas is empty"),
-        ("hidden", "[64,64],128", "expected one list, as 64,64, or several, as [64,64],[128]"),
+        ("hidden", "[64,64],128", "expected one list (64,64) or several ([64,64],[128])"),
         ("hidden", "[64,64][128]", "expected one list"),
         ("hidden", "[[64],[128]]", "expected one list"),
         ("hidden", "[64,64", "expected one list"),

@@ -489,7 +489,7 @@ def test_a_finished_run_of_another_definition_is_not_taken_for_this_one(tmp_path
     assert run_command(command(tmp_path, *more)) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and "the constraint's bound: 0.05 then, 0.9 now" in err
-    assert "(so it is for 1 more); overwrite=changed starts such runs again" in err
+    assert "(the same holds for 1 more); overwrite=changed starts such runs again" in err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
     if not more:
         assert run_command(command(tmp_path, "overwrite=true")) == 0
@@ -594,17 +594,24 @@ def test_runs_without_a_definition(tmp_path, capsys, define_task):
     assert run_command(command(tmp_path)) == 0 and "already finished" in capsys.readouterr().out
     define_task(l1(scaled(1.0)))
     assert run_command(command(tmp_path)) == 2
-    assert "does not tell on which definition" in capsys.readouterr().err
+    assert "has no readable definition.json" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("content", ['{"task": {"constraint": 3}, "algorithm": {}}', "[]", '{"task": []}'])
-def test_a_damaged_definition_is_no_traceback(tmp_path, capsys, define_task, content):
+@pytest.mark.parametrize(
+    "content, said",
+    [
+        ('{"task": {"constraint": 3}, "algorithm": {}}', "another definition of its task"),
+        ("[]", "no readable definition.json"),
+        ('{"task": []}', "no readable definition.json"),
+    ],
+)
+def test_a_damaged_definition_is_no_traceback(tmp_path, capsys, define_task, content, said):
     define_task(l1(scaled(1.0)))
     assert run_command(command(tmp_path)) == 0
     for path in tmp_path.rglob("definition.json"):
         path.write_text(content)
     assert run_command(command(tmp_path)) == 2
-    assert "definition of its task" in capsys.readouterr().err
+    assert said in capsys.readouterr().err
     assert plot.main([str(tmp_path), "format=csv"]) == 0
 
 

@@ -102,7 +102,10 @@ def test_a_failed_run_is_reported_and_not_run_again_unless_asked(tmp_path, monke
     runs, problems = read_results(tmp_path)
     assert problems == [] and len(runs) == 3
     (line,) = list_diverged(groups := group_runs(runs)[0])
-    assert "DPre: 1 of 3 seeds diverged; best parameters before: seed 5 failed at step 86: critic loss" in line
+    assert (
+        "DPre: 1 of 3 seeds diverged and count with their best parameters before: seed 5 failed at step 86: critic loss"
+        in line
+    )
     assert list_left_out(groups) == []
     ((cell,),) = [by_algo.values() for by_algo in groups.values()]
     assert (count_failed(cell), count_diverged(cell)) == (0, 1)

@@ -343,7 +343,7 @@ def test_what_cannot_be_stepped_together():
     first, second, other = envs.make("R+N"), envs.make("R+N"), envs.make("R+L2")
     first.reset(seed=0), other.reset(seed=0)
     for group in ([first, other], [first, first]):  # two constraints; one environment twice
-        with pytest.raises(ValueError, match="different environments of one constraint"):
+        with pytest.raises(ValueError, match="different environments with the same constraint"):
             envs.step_together(group, np.zeros((2, 2)))
     with pytest.raises(gymnasium.error.ResetNeeded):
         envs.step_together([first, second], np.zeros((2, 2)))

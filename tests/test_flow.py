@@ -178,7 +178,7 @@ def test_gradients_pass_flow_and_projection():
 
 
 def test_a_map_without_a_flow_says_so():
-    with pytest.raises(RuntimeError, match="^this map has no flow yet: sweep.flows trains one"):
+    with pytest.raises(RuntimeError, match="^this map has no flow yet: train one with sweep.flows"):
         Flow()(CONSTRAINT, torch.zeros(1, 3), torch.zeros(1, 2), None)
     assert Flow().state() == {}
 

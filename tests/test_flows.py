@@ -219,7 +219,7 @@ def test_a_process_takes_over_from_another_that_ended_without_a_flow(tmp_path, m
 
 def test_a_flow_that_leaves_much_outside_is_noted(tmp_path, monkeypatch, capsys):
     train(tmp_path, f"{WORDS} flow_steps=1")
-    assert "note: the flow of R+O10 takes " in capsys.readouterr().err
+    assert "note: the flow of R+O10 maps " in capsys.readouterr().err
     monkeypatch.setattr(flows, "WIDE", 1.1)
     train(tmp_path, WORDS.replace("3,5", "8"))
     assert "% of the set; no policy can use the rest" in capsys.readouterr().err

@@ -567,12 +567,12 @@ def test_center_on_the_boundary_raises(constraint):
 
 def test_misuse():
     with pytest.raises(
-        TypeError, match=r"an intersection is of constraints, got list; pass them one by one: Intersection\(a, b\)"
+        TypeError, match=r"Intersection takes constraints, got list; pass them one by one: Intersection\(a, b\)"
     ):
         Intersection([Box(2), Box(2)])
-    with pytest.raises(TypeError, match=r"^the constraint is an object of a constraints.Constraint, got <class"):
+    with pytest.raises(TypeError, match=r"^constraint must be an instance of constraints.Constraint, got <class"):
         InUnits(LinearConstraint, -1.0, 1.0)
-    with pytest.raises(TypeError, match=r"^an intersection is of constraints, got float$"):
+    with pytest.raises(TypeError, match=r"^Intersection takes constraints, got float$"):
         Intersection(Box(2), 0.3)
     with pytest.raises(ValueError, match="at least one"):
         Intersection()

@@ -173,7 +173,7 @@ def test_gradients_of_the_least_violation():
 
 def test_choices_of_on_empty():
     assert linear().on_empty == "error" and curved("least").on_empty == "least"
-    with pytest.raises(ValueError, match="on_empty is 'nearest' \\(choices: 'error' 'least'\\)"):
+    with pytest.raises(ValueError, match="unknown on_empty 'nearest' \\(choices: error, least\\)"):
         linear("nearest")
 
 

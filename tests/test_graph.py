@@ -309,7 +309,7 @@ def test_a_captured_step_goes_on_from_any_moment(cuda_stand_in, monkeypatch):
 def test_an_algorithm_that_does_not_count_its_steps_is_an_error(cuda_stand_in, monkeypatch):
     agent, replay, _ = make("DPre")
     monkeypatch.setattr(agent, "update", lambda batch: None)
-    with pytest.raises(RuntimeError, match="must count its steps"):
+    with pytest.raises(RuntimeError, match="must add 1 to `updates`"):
         cuda_stand_in(agent, replay, BATCH)()
 
 

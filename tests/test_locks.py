@@ -41,7 +41,7 @@ def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
 def test_the_lock_of_another_host_is_for_a_person_to_delete(tmp_path):
     lock = tmp_path / "seed=1.lock"
     lock.write_text(json.dumps({"pid": 7, "host": "node-12"}))
-    with pytest.raises(LockedError, match=rf"by process 7 on node-12; if that has ended, delete {lock}"):
+    with pytest.raises(LockedError, match=rf"by process 7 on node-12; if that process has ended, delete {lock}"):
         run_lock(tmp_path / "seed=1").__enter__()
     assert lock.exists()
 

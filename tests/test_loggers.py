@@ -159,7 +159,7 @@ def test_an_unknown_logger_is_refused(tmp_path, capsys, value):
     assert run_command(f"algo=DRad {WORDS} log={value} results={tmp_path}".split()) == 2
     assert (
         capsys.readouterr().err
-        == f"run.py: bad value {value!r} for log: must list some of csv, tensorboard, wandb, with commas between them\n"
+        == f"run.py: bad value {value!r} for log: must be one or several of csv, tensorboard, wandb, comma separated\n"
     )
 
 
@@ -190,8 +190,8 @@ def test_a_logger_that_fails_is_named_once_and_the_training_goes_on(tmp_path, mo
     assert run_command(f"algo=DRad {WORDS} seed=3 log=wandb,tensorboard results={tmp_path}".split()) == 0
     (folder,) = find_runs(tmp_path)
     said = [line for line in capsys.readouterr().err.splitlines() if "log=wandb" in line]
-    assert len(said) == 1 and f"{folder}: log=wandb ends after step" in said[0]
-    assert "no space left on device (the training goes on" in said[0]
+    assert len(said) == 1 and f"{folder}: log=wandb stops after step" in said[0]
+    assert "no space left on device (the training continues" in said[0]
     assert_shows_the_files(folder, "DRad")  # the other logger is complete
 
 
@@ -199,7 +199,7 @@ def test_a_logger_that_fails_at_the_end_leaves_the_result(tmp_path, monkeypatch,
     calls = 1 + 6 + 4 + 1  # opening, evaluations, training, result
     monkeypatch.setitem(loggers.LOGGERS, "wandb", Failing(calls))
     assert run_command(f"algo=DRad {WORDS} seed=3 log=wandb results={tmp_path}".split()) == 0
-    assert "log=wandb ends after step 60" in capsys.readouterr().err
+    assert "log=wandb stops after step 60" in capsys.readouterr().err
     assert read_run(*find_runs(tmp_path)).finished
 
 

@@ -136,11 +136,11 @@ def test_the_entropy_in_unit_ball_coordinates_is_a_setting_of_the_map():
     [
         (SAC, Project(), "layer", "SAC needs the log-density of mapped actions, and Project has no with_log_prob"),
         (SAC, Project(), "rollout", "SAC is implemented for placement environment and layer, not rollout"),
-        (SAC, Alpha(), "environment", "Alpha can stand in placement layer, not environment"),
+        (SAC, Alpha(), "environment", "Alpha supports placement layer, not environment"),
         (SAC, Gauge(), "rollout", "SAC is implemented for placement environment and layer, not rollout"),
         (SAC, Bare(), "layer", "Bare has no with_log_prob"),
-        (TD3, Alpha(), "rollout", "Alpha can stand in placement layer, not rollout"),
-        (TD3, Gauge(), "environment", "Gauge can stand in placement layer, not environment"),
+        (TD3, Alpha(), "rollout", "Alpha supports placement layer, not rollout"),
+        (TD3, Gauge(), "environment", "Gauge supports placement layer, not environment"),
         (TD3, Project(), "wrapper", "unknown placement 'wrapper'"),
         (NFWPO, Project(), "layer", "NFWPO is implemented for placement rollout, not layer"),
         (NFWPO, Radial(), "rollout", "NFWPO is implemented for Project, not Radial"),
@@ -178,7 +178,7 @@ def test_an_agent_that_is_not_complete_is_refused_with_what_is_missing():
         Algorithm(Half, Project(), "layer")
     missing = "explore, networks, optimizers, policy, update, family, paper"
     assert str(error.value) == f"Half is not complete: it does not define {missing}"
-    with pytest.raises(ValueError, match="^Nameless.paper has no 'Others'"):
+    with pytest.raises(ValueError, match="^Nameless.paper needs an entry 'Others'"):
         Algorithm(Nameless, Project(), "layer")
 
 
@@ -294,10 +294,10 @@ def test_a_setting_that_cannot_be_a_key_is_refused():
     Algorithm(TD3, Dense(), "layer")
     Algorithm(TD3, Weighted(), "layer")
     for agent, map, penalty, reason in (
-        (TD3, Slow(), False, "Slow.tau has the name of a setting of TD3"),
-        (SAC, Dense(), False, "Dense.gsde has the name of a setting of SAC"),
-        (TD3, Seeded(), False, "Seeded.seed has the name of a setting of TD3"),
-        (TD3, Weighted(), True, "Weighted.penalty has the name of a setting of TD3"),
+        (TD3, Slow(), False, "Slow.tau has the same name as a setting of TD3"),
+        (SAC, Dense(), False, "Dense.gsde has the same name as a setting of SAC"),
+        (TD3, Seeded(), False, "Seeded.seed has the same name as a setting of TD3"),
+        (TD3, Weighted(), True, "Weighted.penalty has the same name as a setting of TD3"),
         (TD3, Plain(), False, "Plain.scale must be made with core.config.setting"),
         (PlainDDPG, Soft(), False, "PlainConfig.rate must be made with core.config.setting"),
     ):

@@ -96,10 +96,10 @@ def test_actions_of_what_cannot_be_played(trained, tmp_path, capsys):
 
     assert "one folder of a run" in refused_by_plot(capsys, "actions")
     assert "is not the folder of a run" in refused_by_plot(capsys, "actions", tmp_path / "nowhere")
-    assert "W+M is no task of two dimensions (choices: R+N, R+L2" in refused_by_plot(
+    assert "W+M does not have two-dimensional actions (choices: R+N, R+L2" in refused_by_plot(
         capsys, "actions", copy("W+M", "SRad")
     )
-    assert "Mine on R+M is not of this project" in refused_by_plot(capsys, "actions", copy("R+M", "Mine"))
+    assert "unknown algorithm or task, Mine on R+M" in refused_by_plot(capsys, "actions", copy("R+M", "Mine"))
     assert "best.pt does not fit" in refused_by_plot(capsys, "actions", copy("R+M", "DRad"))
     parameters = copy("R+L2", "SRad") / "best.pt"
     parameters.write_bytes(b"")

@@ -139,9 +139,9 @@ def test_a_policy_of_a_task_that_has_changed_says_so(tmp_path, monkeypatch):
     "content, said",
     [
         (b"", "is damaged: EOFError"),
-        ([1, 2], "has no table of tensors"),
-        (torch.ones(3), "has no table of tensors"),
-        ({"actor.layers.0.weight": [1.0]}, "has no table of tensors"),
+        ([1, 2], "is not a dict of tensors"),
+        (torch.ones(3), "is not a dict of tensors"),
+        ({"actor.layers.0.weight": [1.0]}, "is not a dict of tensors"),
     ],
 )
 def test_parameters_that_are_none_are_refused(finished, tmp_path, content, said):

@@ -113,7 +113,7 @@ def test_variant_names():
     assert settings["hidden"] == "[64,32]"
     assert results.parse_variant("NFW") == ("NFW", {})
     for task, variant in (("a/b", "SRad"), ("R+N", "SRad,x=/tmp"), ("..", "SRad"), ("R+N", "")):
-        with pytest.raises(ValueError, match="cannot name"):
+        with pytest.raises(ValueError, match="for a run's folder"):
             results.run_folder("results", task, variant, 0)
 
 

@@ -85,11 +85,11 @@ def test_words_and_their_labels(tmp_path):
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["b/="], "bad label '' of b"),
-        (["b/=x (y)"], "bad label 'x (y)' of b"),
-        (["b/= x"], "bad label ' x' of b"),
-        (["b/=paper"], "bad label 'paper' of b"),
-        (["b/=x", "c/=x"], "two folders have the label 'x': give c another one, as c=LABEL"),
+        (["b/="], "bad label '' for b"),
+        (["b/=x (y)"], "bad label 'x (y)' for b"),
+        (["b/= x"], "bad label ' x' for b"),
+        (["b/=paper"], "bad label 'paper' for b"),
+        (["b/=x", "c/=x"], "two folders have the label 'x': give c another one with c=LABEL"),
         (["b/", "c/b/"], "two folders have the label 'b'"),
     ],
 )
@@ -203,8 +203,8 @@ def test_a_return_that_is_not_a_number_fails_as_for_our_runs(tmp_path, capsys):
     "row, said",
     [
         ("R+L2,SRad,0,10000,1.0", "line 8: SRad on R+L2, seed 0, has step 10000 twice"),
-        ("R+L2,SRad,0.5,1,1.0", "line 8: bad value '0.5' for seed: expected a whole number from 0 on"),
-        ("R+L2,SRad,0,-1,1.0", "line 8: bad value '-1' for step: expected a whole number from 0 on"),
+        ("R+L2,SRad,0.5,1,1.0", "line 8: bad value '0.5' for seed: expected a whole number of at least 0"),
+        ("R+L2,SRad,0,-1,1.0", "line 8: bad value '-1' for step: expected a whole number of at least 0"),
         ("R+L2,SRad,0,1e3,1.0", "line 8: bad value '1e3' for step"),
         ("R+L2,SRad,0,1,much", "line 8: bad value 'much' for return: expected a number"),
         ("R+L2,SRad,0,1", "line 8: bad value '' for return: expected a number"),

@@ -177,7 +177,10 @@ def test_a_diverged_seed_counts_with_its_best_parameters_and_a_dagger(tmp_path, 
     assert (cell["mean"], cell["n"], cell["failed"], cell["diverged"]) == ("9.0", "4", "2", "1")
     text = (tmp_path / "tables" / "rewards.md").read_text()
     assert "**9.00†** ± 1.00 n=4 1 of 6 diverged 2 failed" in text
-    assert "† In the tables:\n- R+T SRad: 1 of 6 seeds diverged; best parameters before: seed 3" in text
+    assert (
+        "† In the tables:\n- R+T SRad: 1 of 6 seeds diverged and count with their best parameters before: seed 3"
+        in text
+    )
     assert "seed 3 failed at step 12345: critic loss is not finite (best parameters before: return 6.00)" in printed
     assert "R+T SRad: seed 4 failed at step 12345" in text.partition("†\nIn the tables")[0]
     assert r"9.00$^\dagger$" in (tmp_path / "tables" / "rewards.tex").read_text()

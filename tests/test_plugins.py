@@ -116,8 +116,8 @@ def test_a_program_can_be_its_own_plugin(plugin):
     [
         ("other.py", None, "expected a Python file (.py), and there is no such file"),
         ("other.txt", "", "expected a Python file (.py)"),
-        ("random.py", "", "has the name of another module, random: rename it"),
-        ("algos.py", "", "has the name of another module, algos: rename it"),
+        ("random.py", "", "has the same name as another module, random: rename it"),
+        ("algos.py", "", "has the same name as another module, algos: rename it"),
         ("other.py", "x = 1\ny = (\n", "other.py, line 2: SyntaxError: "),
         ("other.py", "import os\n\nraise KeyError('a\\nb')\n", "other.py, line 3: KeyError: "),
         ("other.py", "import no_such_module\n", "other.py, line 1: ModuleNotFoundError: No module named"),
@@ -131,7 +131,7 @@ def test_a_program_can_be_its_own_plugin(plugin):
         (
             "other.py",
             "from sweep.train import train_words\ntrain_words('algo=DPre env=R+N')\n",
-            "line 2: ConfigError: a plugin only registers: train below `if __name__",
+            "line 2: ConfigError: a plugin must not train when it is imported: train below `if __name__",
         ),
     ],
 )
@@ -161,7 +161,9 @@ def test_a_plugin_without_a_name(tmp_path, monkeypatch, capsys, value):
 
 
 def test_a_name_is_registered_once_and_fits_on_a_command_line():
-    with pytest.raises(ValueError, match="the algorithm 'DPre' exists: take another name, or delete it first"):
+    with pytest.raises(
+        ValueError, match="the algorithm 'DPre' exists already: choose another name, or delete it first"
+    ):
         ALGORITHMS["DPre"] = ALGORITHMS["DPro"]
     for more in ({"DPre": ALGORITHMS["DPro"]}, {"a b": ALGORITHMS["DPro"]}):
         with pytest.raises(ValueError):

@@ -3,6 +3,7 @@
 import gzip
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -61,6 +62,17 @@ def test_the_same_runs_make_the_same_files(results, tmp_path):
     assert publish(results, tmp_path / "two") == 0
     for file in (tmp_path / "one" / "R+L2").iterdir():
         assert file.read_bytes() == (tmp_path / "two" / "R+L2" / file.name).read_bytes()
+
+
+def test_no_training_rows_of_replaced_runs_stay(results, tmp_path):
+    assert publish(results, tmp_path) == 0
+    folder, published = tmp_path / "R+L2", read_published(tmp_path)
+    training = {"step": np.array([1000]), "critic_loss": np.array([0.5])}
+    write_published(folder, [replace(p, run=replace(p.run, training=training)) for p in published])
+    assert [p.run.training for p in read_published(tmp_path)] == [training] * 4
+    write_published(folder, [replace(p, run=replace(p.run, training={})) for p in published])
+    assert [p.run.training for p in read_published(tmp_path)] == [{}] * 4
+    assert not (folder / "training.csv.gz").exists()
 
 
 def cut(path):

@@ -198,8 +198,8 @@ def test_the_fingertip_is_where_the_angles_put_it_one_step_late():
 
 def test_a_simulator_that_is_not_there_is_one_clear_line(monkeypatch):
     for task, message in (
-        ("R+N", r"unknown simulator 'mujoco' for R\+N \(choices: closed-form pybullet\)"),
-        ("W+M", r"unknown simulator 'mujoco' for W\+M \(its robot has no choice of simulators\)"),
+        ("R+N", r"unknown simulator 'mujoco' for R\+N \(choices: closed-form, pybullet\)"),
+        ("W+M", r"unknown simulator 'mujoco' for W\+M \(its robot has only one simulator\)"),
     ):
         with pytest.raises(envs.UnavailableError, match=message):
             envs.make(task, simulator="mujoco")

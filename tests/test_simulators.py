@@ -131,7 +131,7 @@ def test_a_resumed_run_tells_that_its_threads_have_changed(tmp_path):
     said = [process.stdout.readline() for _ in range(2)]
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 143
-    assert "resuming from step" in said[0] and "threads=1 now, 2 before: equal up to rounding" in said[1]
+    assert "resuming from step" in said[0] and "threads=1 now, 2 before: equal to an uninterrupted run" in said[1]
 
 
 class SlowArm(Reacher):

@@ -110,7 +110,7 @@ def test_settings_of_a_sweep_are_no_settings_of_its_runs():
         ("launcher=slurm slurm.gpus=2 device=cpu", "slurm.gpus=2 needs device=cuda"),
         ("launcher=slurm slurm.gpus=1 device=gpu", "bad value 'gpu' for device: must be auto, cpu, cuda or cuda:N"),
         ("device=cuda:", "bad value 'cuda:' for device: must be auto, cpu, cuda or cuda:N"),
-        ("launcher=slurm overwrite=true", "overwrite=true does not go with launcher=slurm"),
+        ("launcher=slurm overwrite=true", "overwrite=true cannot be used with launcher=slurm"),
         ("jobs=2 slurm.cpus=2", "slurm.cpus= needs launcher=slurm"),
         ("jobs=2 seed=1-0", "is empty"),
     ],
@@ -160,7 +160,7 @@ def test_a_text_that_cannot_name_a_folder_is_refused(tmp_path, monkeypatch, caps
     mine = type("Mine", (TD3,), {"config_class": TextConfig})
     monkeypatch.setitem(ALGORITHMS, "DMine", Algorithm(mine, Project(), "layer"))
     assert run_command(["algo=DMine", "env=R+N", "source=data/a.csv", f"results={tmp_path}"]) == 2
-    assert "bad value 'data/a.csv' for source: it names the run's folder" in capsys.readouterr().err
+    assert "bad value 'data/a.csv' for source: it is part of the run's folder name" in capsys.readouterr().err
 
 
 def test_a_folder_of_a_user_that_nobody_knows_is_a_name_like_any_other(tmp_path, monkeypatch, capsys):
@@ -395,7 +395,7 @@ def test_states(tmp_path):
     assert state_of(cell, {"12_4": "RUNNING"}).stage is Stage.NEW
     for folder in cell.folders:
         folder.mkdir(parents=True)
-    assert "job 12_3 is gone" in state_of(cell, {}).detail
+    assert "job 12_3 ended early" in state_of(cell, {}).detail
     (cell.folders[0] / "checkpoint").mkdir()
     (cell.folders[0] / "checkpoint" / "replay-20-40.f32").touch()
     (cell.folders[1] / "result.json").touch()
@@ -611,7 +611,7 @@ def test_a_job_of_another_cluster_is_not_taken_for_gone(cluster, monkeypatch, ca
     (cluster / "queue").write_text("41 RUNNING\n")  # another job with that number
     capsys.readouterr()
     assert run_command([*words, "launcher=slurm"]) == 0
-    said = f"Slurm does not tell here of job 41 of cluster big; if that is over, delete {cell.record('job')}"
+    said = f"Slurm on this machine does not know job 41 of cluster big; if the job is over, delete {cell.record('job')}"
     out = capsys.readouterr().out
     assert f"DPre R+N is not submitted: {said}" in out and "nothing to submit" in out
     assert not (cluster / "42.sh").exists()
@@ -630,7 +630,7 @@ def test_a_submission_that_another_host_left_open_names_its_lock(cluster, capsys
     lock.write_text(json.dumps({"pid": 7, "host": "elsewhere"}))
     assert run_command(["algo=DPre", "env=R+N", "launcher=slurm", f"results={cluster / 'results'}"]) == 2
     err = capsys.readouterr().err
-    assert err.count("\n") == 1 and f"by process 7 on elsewhere; if that has ended, delete {lock}" in err
+    assert err.count("\n") == 1 and f"by process 7 on elsewhere; if that process has ended, delete {lock}" in err
 
 
 def test_what_sbatch_refuses_is_said_in_one_line(cluster, monkeypatch, capsys):
@@ -713,7 +713,7 @@ def test_a_job_that_cannot_be_requeued_says_so(cluster, monkeypatch, job):
 def test_a_job_without_a_checkpoint_before_its_time_limit_is_not_requeued_for_ever(job):
     assert job(USR2, 20) and not job(USR2, 20)
     state = state_of(job.cell, {})
-    assert state.stage is Stage.FAILED and "not requeued: no checkpoint between" in state.detail
+    assert state.stage is Stage.FAILED and "not requeued: the job wrote no new checkpoint before" in state.detail
     assert job(TERM, 20)  # preempted at once
 
 

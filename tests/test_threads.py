@@ -102,4 +102,4 @@ def test_a_run_that_resumes_on_another_device_says_so(tmp_path, capsys, monkeypa
     monkeypatch.setattr(Cell, "settings", saved)
     capsys.readouterr()
     assert train(tmp_path, f"{CHECKPOINTED} device=cpu")
-    assert "(device=cpu now, cuda before: equal up to rounding to an unbroken run)" in capsys.readouterr().out
+    assert "(device=cpu now, cuda before: equal to an uninterrupted run only up to rounding)" in capsys.readouterr().out

@@ -63,5 +63,5 @@ def test_whole_numbers():
     assert (whole_number("n", "3e5"), whole_number("n", "007"), whole_number("n", "0", least=0)) == (300_000, 7, 0)
     assert whole_numbers("n", "1,2e1") == [1, 20]
     for text in ("0", "-1", "1.5", "x", "", "nan", "inf"):
-        with pytest.raises(ConfigError, match="for n: expected whole numbers from 1 on"):
+        with pytest.raises(ConfigError, match="for n: expected a whole number of at least 1"):
             whole_number("n", text)

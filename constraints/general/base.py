@@ -71,7 +71,7 @@ class GeneralConstraint(Constraint):
     def __init__(self, dim: int, on_empty: OnEmpty = "error"):
         super().__init__(dim)
         if on_empty not in ("error", "least"):
-            raise ValueError(f"on_empty is {on_empty!r} (choices: 'error' 'least')")
+            raise ValueError(f"unknown on_empty {on_empty!r} (choices: error, least)")
         self.on_empty = on_empty
         self._compared: set[str] = set()
 
@@ -111,8 +111,8 @@ class GeneralConstraint(Constraint):
             return at
         if is_mapped():
             raise RuntimeError(
-                f"{type(self).__name__} looks at values, which torch.func.vmap hides from all methods but project; they"
-                " take batches of any leading shape as they are"
+                f"{type(self).__name__} supports torch.func.vmap only in project; its other methods take batches of"
+                " any leading shape without vmap"
             )
         return self._coefficients(at)
 
@@ -204,7 +204,9 @@ class GeneralConstraint(Constraint):
                 return deep_points(sets)
             center, guess = interior_points(sets.detach()), guessed_points(sets)
             if not torch.equal(center, guess):
-                self._refuse_derivatives(at, "where the centre of its ellipse, or the origin, is not deep inside")
+                self._refuse_derivatives(
+                    at, "where the centre of its ellipse, or the origin, is not deep inside the set"
+                )
                 return center
             return guess
 

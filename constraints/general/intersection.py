@@ -34,12 +34,12 @@ class Intersection(GeneralConstraint):
         wrong = next((part for part in constraints if not isinstance(part, Constraint)), None)
         if wrong is not None:
             hint = "; pass them one by one: Intersection(a, b)" if isinstance(wrong, list | tuple) else ""
-            raise TypeError(f"an intersection is of constraints, got {type(wrong).__name__}{hint}")
+            raise TypeError(f"Intersection takes constraints, got {type(wrong).__name__}{hint}")
         if not constraints:
             raise ValueError("an intersection needs at least one constraint")
         dims = {constraint.dim for constraint in constraints}
         if len(dims) > 1:
-            raise ValueError(f"constraints of different dimensions: {sorted(dims)}")
+            raise ValueError(f"the constraints have different dimensions: {sorted(dims)}")
         super().__init__(dims.pop(), on_empty)
         self.constraints = constraints
 

@@ -43,13 +43,13 @@ class LinearConstraint(GeneralConstraint):
     def A(self, obs: Tensor) -> Tensor:
         """Rows (..., m, d), of any norm, at obs (..., n), which is float64. Methods scale them to unit norm."""
         if self._A is None:
-            raise TypeError(f"{type(self).__name__} needs A(obs)")
+            raise TypeError(f"{type(self).__name__} needs A(obs): pass A, or override it")
         return self._A(obs)
 
     def b(self, obs: Tensor) -> Tensor:
         """Bounds (..., m) of the rows at obs (..., n)."""
         if self._b is None:
-            raise TypeError(f"{type(self).__name__} needs b(obs)")
+            raise TypeError(f"{type(self).__name__} needs b(obs): pass b, or override it")
         return self._b(obs)
 
     def explicit(self, obs: Tensor) -> ExplicitSet:

@@ -48,13 +48,13 @@ class QuadraticConstraint(GeneralConstraint):
     def Q(self, obs: Tensor) -> Tensor:
         """Matrix (..., d, d), symmetric positive semi-definite, at obs (..., n), which is float64."""
         if self._Q is None:
-            raise TypeError(f"{type(self).__name__} needs Q(obs)")
+            raise TypeError(f"{type(self).__name__} needs Q(obs): pass Q, or override it")
         return self._Q(obs)
 
     def bound(self, obs: Tensor) -> Tensor | float:
         """Bound (...) or a number, positive."""
         if self._bound is None:
-            raise TypeError(f"{type(self).__name__} needs bound(obs)")
+            raise TypeError(f"{type(self).__name__} needs bound(obs): pass bound, or override it")
         return self._bound(obs) if callable(self._bound) else self._bound
 
     def c(self, obs: Tensor) -> Tensor:

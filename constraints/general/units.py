@@ -28,7 +28,7 @@ class InUnits(GeneralConstraint):
 
     def __init__(self, constraint: Constraint, low: ArrayLike, high: ArrayLike):
         if not isinstance(constraint, Constraint):
-            raise TypeError(f"the constraint is an object of a constraints.Constraint, got {constraint!r}")
+            raise TypeError(f"constraint must be an instance of constraints.Constraint, got {constraint!r}")
         super().__init__(constraint.dim, constraint.on_empty)
         least, most = (np.asarray(bound, np.float64).reshape(-1) for bound in (low, high))
         if any(len(bound) not in (1, self.dim) for bound in (least, most)):

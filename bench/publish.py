@@ -113,7 +113,7 @@ def _check_provenance(info: Mapping[str, Any]) -> None:
 
 def _check_settings(run: Run, any_settings: bool) -> None:
     if run.task not in TASKS or run.algo not in ALGORITHMS:
-        raise RefusedError(f"{run.algo} on {run.task} is not of this project")
+        raise RefusedError(f"unknown algorithm or task, {run.algo} on {run.task}")
     config = saved_config(run.config)
     variant = variant_folder(variant_name(config.algo, differences(config, paper_config(config.algo, config.env))))
     for says, holds in ((run.task, config.env), (run.variant, variant), ((run.seed,), config.seeds)):

@@ -194,7 +194,7 @@ def test_a_run_of_an_algorithm_of_ones_own_is_named(results, tmp_path, capsys):
     for seed in (0, 1):
         edited("config.yaml", {"algo": "Mine"})(results / "R+L2" / "Mine" / f"seed={seed}")
     assert publish(results, tmp_path / "data") == 1
-    assert "Mine on R+L2 is not of this project" in capsys.readouterr().err
+    assert "unknown algorithm or task, Mine on R+L2" in capsys.readouterr().err
 
 
 def test_a_published_run_is_not_replaced_and_other_seeds_of_its_cell_come_beside_it(results, tmp_path, capsys):

@@ -32,7 +32,7 @@ from envs.wrapper import MAPPINGS, Constrained
 ROUNDS = 3
 PENDULUM = InUnits(SpeedLimit(dim=1), -2.0, 2.0)
 ROWS: dict[str, tuple[Callable[[], gymnasium.Env], Constraint]] = {
-    "Pendulum-v1, barrier function (rows of one's own)": (lambda: gymnasium.make("Pendulum-v1", g=3.0), PENDULUM),
+    "Pendulum-v1, barrier function (rows of your own)": (lambda: gymnasium.make("Pendulum-v1", g=3.0), PENDULUM),
     "HalfCheetah-v5, HC+O (closed form)": (lambda: gymnasium.make("HalfCheetah-v5"), envs.constraint("HC+O")),
     "Walker2d-v5, W+M (closed form)": (lambda: gymnasium.make("Walker2d-v5"), envs.constraint("W+M")),
 }

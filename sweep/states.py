@@ -89,7 +89,7 @@ def state_of(cell: CellFolders, jobs: Mapping[str, str]) -> CellState:
         reason = end.get("reason") or reason_of(end["exit_code"], Path(end["log"]))
         return CellState(Stage.FAILED, step, f"{reason} (log: {end['log']})")
     if known:
-        detail = f"Slurm on this machine does not know job {job}; if the job is over, delete {cell.record('job')}"
+        detail = f"Slurm does not say here whether job {job} is over; if it is, delete {cell.record('job')}"
         return CellState(Stage.UNKNOWN, step, detail)
     if step or any(folder.exists() for folder in unended):
         return CellState(

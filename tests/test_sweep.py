@@ -611,7 +611,7 @@ def test_a_job_of_another_cluster_is_not_taken_for_gone(cluster, monkeypatch, ca
     (cluster / "queue").write_text("41 RUNNING\n")  # another job with that number
     capsys.readouterr()
     assert run_command([*words, "launcher=slurm"]) == 0
-    said = f"Slurm on this machine does not know job 41 of cluster big; if the job is over, delete {cell.record('job')}"
+    said = f"Slurm does not say here whether job 41 of cluster big is over; if it is, delete {cell.record('job')}"
     out = capsys.readouterr().out
     assert f"DPre R+N is not submitted: {said}" in out and "nothing to submit" in out
     assert not (cluster / "42.sh").exists()

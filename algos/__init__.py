@@ -147,8 +147,9 @@ def load_policy(folder: str | Path, which: str = "best") -> Policy:
     `which`: "best" loads the parameters of the best evaluation so far, "last" the parameters at the end of the training
     or, if it is unfinished, in its newest checkpoint. Everything is on the CPU.
 
-    Raises ConfigError, a ValueError, for another `which`, for a folder without a run or without these parameters, and
-    for an unknown algorithm or task. Import the file that defines your own algorithm or task first.
+    Raises ConfigError, a ValueError, for another `which`, for a folder without a run or without these parameters, for a
+    bad configuration, and for an unknown algorithm or task. Import the file that defines your own algorithm or task
+    first. With "last", raises `store.checkpoint.FormatError` if another version of this code wrote the checkpoint.
     """
     folder = user_path(folder)
     settings = settings_of(folder)

@@ -42,7 +42,7 @@ class ARAMConfig(Config):
     learn_temperature: bool = setting(True, "ARAM: learn the weight of the entropy, as SAC does")
     reward_shift: float = setting(0.0, "ARAM: constant added to the task's rewards in gradient steps")
     rejection_penalty: float = setting(0.2, "ARAM: cost of a rejected action", NOT_NEGATIVE)
-    most_rejections: int = setting(100, "ARAM: rejected draws before the last draw is projected", AT_LEAST_ONE)
+    most_rejections: int = setting(100, "ARAM: draws a step; if all are rejected, the last is projected", AT_LEAST_ONE)
     rejected_share: float = setting(0.2, "ARAM: initial share of rejected actions in a batch", SHARE)
     rejected_share_decay: float = setting(0.99, "ARAM: factor by which rejected_share decays", POSITIVE_SHARE)
     rejected_share_every: int = setting(10_000, "ARAM: environment steps between these decays", AT_LEAST_ONE)
@@ -116,7 +116,7 @@ class ARAM(Agent):
         self.rejected, self.steps = (zeros(1, dtype=torch.int64) for _ in range(2))  # counts of actions and steps
         self.measured = torch.zeros(seeds, dtype=torch.int64)  # `steps` on the CPU: acting does not wait for a GPU
         self.missing = zeros(config.snapshots) + torch.inf  # 0 for each earlier critic, inf if there is none yet
-        self.copies = torch.zeros(seeds, dtype=torch.int64)  # of the critic so far
+        self.copies = torch.zeros(seeds, dtype=torch.int64)  # the number of copies of the critic so far
         # Means over steps: rejected draws, share of steps that project, share of the draws that are feasible.
         self.measures = torch.zeros(seeds, 3)
         self.entropy = zeros(1)  # of the policy at the last batch's states
@@ -155,7 +155,7 @@ class ARAM(Agent):
 
     @torch.no_grad()
     def act(self, obs: Tensor, center: Tensor | None, warming_up: Sequence[int], exploring: Sequence[int]) -> Action:
-        """Draw until an action is feasible; after `most_rejections` rejected draws, project the last one.
+        """Draw until an action is feasible; if all `most_rejections` draws are rejected, project the last one.
 
         All draws of all seeds are made and checked at once. Draws after the first feasible one count only in
         `acceptance_rate`.
@@ -307,8 +307,11 @@ class ARAM(Agent):
         return self.worths(obs, action, condition, preference).gather(0, (best % critics).unsqueeze(0)).squeeze(0)
 
     def worths(self, obs: Tensor, action: Tensor, condition: Tensor, preference: Tensor) -> Tensor:
-        """The returns (1 + snapshots, seeds, batch) of the current and the earlier critics, weighed by `preference`. Of
-        each pair of twins, the smaller one counts. The critics' input is `condition` (seeds, 1 or batch, 2)."""
+        """The returns (1 + snapshots, seeds, batch) of the current and the earlier critics, weighed by `preference`.
+
+        Of each pair of twin critics, the smaller return counts. The critics get the preference `condition` (seeds, 1 or
+        batch, 2) as input.
+        """
         returns = torch.cat([self.critic(obs, action, condition), self.earlier(obs, action, condition)])
         return (returns * preference).sum(-1).view(-1, 2, *action.shape[:2]).amin(1)
 
@@ -331,8 +334,8 @@ class ARAM(Agent):
 
         Of the environment steps: `acceptance_rate` is the share of a step's draws that are feasible, `rejected_draws`
         the number of rejected draws per step, and `fallbacks` the share of steps that project because all draws are
-        rejected. `acceptance_rate` weighs all steps equally. The number of accepted draws over the number of draws
-        until then would not: most of these draws are in a few states where hardly any draw is feasible.
+        rejected. `acceptance_rate` weighs all steps equally. The number of accepted draws over the number of draws made
+        until one is accepted would not: most of these draws are in a few states where hardly any draw is feasible.
         """
         rejected, fallbacks, acceptance = self.measures.unbind(-1)
         return {

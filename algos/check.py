@@ -72,8 +72,8 @@ def check_parameters(name: str, alone: Agent, among: Agent) -> None:
         if not shape or several[key] != (len(among.seeds) * shape[0], *shape[1:]):
             raise ContractError(
                 f"{name}: parameter {key} has shape {shape} for one seed and {several[key]} for {len(among.seeds)}, so"
-                " seeds would share it; its first axis must have k rows per seed: give core.networks.MLP (or your own"
-                " module) one generator of `init` per row"
+                " seeds would share it; its first axis must have k rows per seed: give core.networks.MLP one generator"
+                " of `init` per row"
             )
     for key, values in alone.state(0).items():
         if not torch.equal(values, among.state(len(among.seeds) - 1)[key]):

@@ -176,7 +176,10 @@ class Floor:
         return [self._view(name, shape) for name, shape in _operands(product)]
 
     def _view(self, name: str, shape: tuple[int, ...]) -> Tensor:
-        """A view of the matrix `name`: its first `shape[0]` rows; of a transpose only the last columns (the action)."""
+        """A view of the matrix `name`: the first `shape[0]` networks.
+
+        Of a transpose, it has only the last `shape[2]` columns (the action).
+        """
         matrix = self.memory[name.removesuffix(".T")]
         if name.endswith(".T"):
             matrix = matrix.mT

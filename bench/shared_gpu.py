@@ -41,8 +41,8 @@ PAUSE = 0.5
 def take_steps(options: dict[str, str], number: int, processes: list[int]) -> None:
     """Measure as process `number`: print its single-seed updates a second for each number in `processes`.
 
-    It pauses and prints 0 where only `number` processes or fewer take part. The process prints a line when it is ready,
-    reads a time (seconds since the epoch) from stdin, and starts then.
+    In a measurement with `number` processes or fewer, this process pauses and prints 0. The process prints a line when
+    it is ready, reads a time (seconds since the epoch) from stdin, and starts then.
     """
     torch.set_num_threads(1)
     seeds, seconds = (whole_number(key, options[key]) for key in ("seeds", "seconds"))

@@ -75,9 +75,8 @@ class Constraint(ABC):
         super().__init_subclass__(**kwargs)
         if wrong := sorted(_DERIVED & vars(cls).keys()):
             raise TypeError(
-                f"{cls.__name__} overrides {', '.join(wrong)}, which some calls would bypass: override _center(at) or"
-                " _gauge_gradients(at, direction, center), c(obs) for the centre of a QuadraticConstraint's ellipse, or"
-                " write a map (core/maps.py)"
+                f"{cls.__name__} overrides {', '.join(wrong)}, but some calls would bypass that: override _center or"
+                " _gauge_gradients (general sets: _part_gauges; an ellipse's centre: c), or write a map (core/maps.py)"
             )
 
     def __init__(self, dim: int):
@@ -162,8 +161,8 @@ class Constraint(ABC):
     def violation(self, obs: Tensor, action: Tensor) -> Tensor:
         """Largest excess (...) over any constraint, box included; the action is feasible where it is <= 0.
 
-        In the penalty's units: linear rows have unit norm (a zero row counts as it stands), an ellipse counts
-        sqrt(a'Qa) - sqrt(b) with Q and b scaled so that tr Q = dim.
+        In the penalty's units: linear rows are scaled to unit norm (a zero row is not scaled); an ellipse counts
+        sqrt(a'Qa) - sqrt(b), with Q and b scaled so that tr Q = dim.
         """
         obs64, action64 = self._broadcast(obs, action)
         box = action64.abs().amax(-1) - 1.0
@@ -176,16 +175,17 @@ class Constraint(ABC):
     def penalty(self, obs: Tensor, action: Tensor) -> Tensor:
         """Penalty (...) of the '+' algorithms on an action in the box (paper, "Algorithms").
 
-        It is the norm of max(Ax - b, 0) with unit rows, max(sqrt(x'Qx) - sqrt(b), 0) with tr Q = dim, and the sum if
-        both are present.
+        For rows, it is the norm of max(Ax - b, 0) after scaling the rows to unit norm. For an ellipse, it is
+        max(sqrt(x'Qx) - sqrt(b), 0) after scaling Q and b so that tr Q = dim. For both, it is the sum.
         """
         obs64, action64 = self._broadcast(obs, action)
         return self._penalty(self._at(obs64), action64).to(action.dtype)
 
     def features(self, obs: Tensor) -> Tensor:
-        """The numbers (..., k), float64, that determine the set at obs (..., n): its coefficients without constants.
+        """The numbers (..., k), float64, that determine the set at obs (..., n).
 
-        For a set whose methods read the observation itself, they are the observation.
+        They are those of its coefficients that depend on obs. If the set has no coefficients (`_at` is not overridden),
+        they are the observation.
         """
         check_observation(obs)
         # The observations get three extra leading axes, and so do coefficients that depend on them. Constants have at
@@ -343,7 +343,7 @@ class Constraint(ABC):
         """The caller's centre (..., d) in float64. ValueError for a wrong shape; `_check_center` checks the values."""
         check_tensor("center", center)
         if center.shape[-1:] != (self.dim,):
-            raise ValueError(f"expected {self.dim} coordinates of the center, got shape {tuple(center.shape)}")
+            raise ValueError(f"expected {self.dim} coordinates of the centre, got shape {tuple(center.shape)}")
         center = center.double()
         if self._center_calls.wanted():
             self._check_center(at, center)
@@ -357,7 +357,7 @@ class Constraint(ABC):
             if outside.any():  # a set may be thinner than that; its own centre is valid all the same
                 own = torch.zeros_like(center) if self.origin_centered else self._center(at)
                 outside = outside & ((center - own).abs().amax(-1) > ROUNDING)
-            require(~outside.flatten(), "the center is not inside the set", name_samples(outside.shape))
+            require(~outside.flatten(), "the centre is not inside the set", name_samples(outside.shape))
 
     def _broadcast(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Both in float64, the action with the common leading shape. ValueError or TypeError for a wrong action."""

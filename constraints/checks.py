@@ -48,7 +48,7 @@ def checked(values: Tensor | float, what: str, shape: tuple[int, ...], obs: Tens
     """Coefficients as float64 (*lead, *shape), finite and of the expected shape, or a ConstraintError.
 
     -1 in `shape` stands for any size; lead may be the observation's leading shape or one that broadcasts to it. With
-    `finite` False, NaN and infinite values pass unread.
+    `finite` False, the values are not read, so NaN and infinite ones pass.
     """
     values = torch.as_tensor(values, dtype=torch.float64, device=obs.device)
     lead = values.shape[: values.dim() - len(shape)]

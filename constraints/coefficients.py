@@ -26,12 +26,12 @@ _always = False
 
 
 def check_inputs(always: bool = True) -> bool:
-    """Make the closed forms check coefficients and given centres in every call of this process, not only in the first.
+    """Make the closed forms check coefficients and given centres in every call, not only in the first 100 of each.
 
-    They raise a ConstraintError for values that are NaN, infinite or of the wrong sign or shape, for a matrix that is
-    not symmetric and positive semi-definite, and for a centre that is not inside the set. General sets always check
-    them. On a GPU, each check waits for the device, so a CUDA graph cannot contain it. Returns the previous value of
-    `always`.
+    This holds for all of them in the process. They raise a ConstraintError for values that are NaN, infinite or of the
+    wrong sign or shape, for a matrix that is not symmetric and positive semi-definite, and for a centre that is not
+    inside the set. General sets always check them. On a GPU, each check waits for the device, so a CUDA graph cannot
+    contain it. Returns the previous value of `always`.
     """
     global _always
     before, _always = _always, always
@@ -39,7 +39,10 @@ def check_inputs(always: bool = True) -> bool:
 
 
 class FirstCalls:
-    """Decides which calls to check: the first ones, if their values can be read without waiting for a device."""
+    """Decides what to check: shapes in the first `_FIRST` calls, and on the CPU values as well.
+
+    With `check_inputs`, it is both in every call on every device.
+    """
 
     def __init__(self) -> None:
         self._left = _FIRST
@@ -60,8 +63,8 @@ class FirstCalls:
 class Coefficient:
     """A function of the observation with values (..., *shape), which `check` may test further.
 
-    A ConstraintError names the coefficient by `what` and, for wrong values, the sample. If an observation is not
-    finite, values are not checked and NaN is passed on.
+    A ConstraintError names the coefficient by `what` and, for wrong values, the sample. If any observation of the batch
+    is not finite, no values of this call are checked; NaN is passed on.
     """
 
     def __init__(

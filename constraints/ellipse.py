@@ -96,8 +96,9 @@ class PlanarEllipse(Constraint):
         on_ellipse, mu = planar.project(action)
         in_box = on_ellipse.abs().amax(-1, keepdim=True) <= 1.0 + _ROUNDING
 
-        # On a face, mirrored to a_i = 1, the best point is that of the feasible interval nearest to the other
-        # coordinate. Squared distances leave out |action|^2, which would swallow their differences for a far point.
+        # On a face, mirrored to a_i = 1, the best point is the point of the feasible interval nearest to the action's
+        # other coordinate. Squared distances leave out |action|^2: for a far point, rounding would hide their
+        # differences.
         own, other = _mirrored(action), _mirrored(action.flip(-1))
         low, high, met = planar.faces()
         moved = torch.minimum(torch.maximum(other, low), high)
@@ -174,7 +175,8 @@ class _Planar(NamedTuple):
         """Projection (..., 2) on the ellipse alone, and its multiplier mu (..., 1).
 
         The point is inv(1 + mu Q) action, whose value a'Qa is numerator / scale^2 with both polynomials in mu. Newton's
-        method solves for 1 / sqrt(value), which is concave and increasing, so from the left it never passes the root.
+        method is applied to 1 / sqrt(value), which is concave and increasing in mu, so from the left it never passes
+        the root.
         """
         trace, determinant = self.diagonal.sum(-1, keepdim=True), self.determinant()
         adjugate = self.adjugate_times(action)

@@ -2,7 +2,8 @@
 
 Let a be the projection of x, with multipliers lam on the active surfaces g_j = 0. In the coordinates that neither the
 box nor a kink holds, a - x + sum lam_j grad g_j = 0 and g_j = 0. These equations define a as a function of x and of all
-that g depends on. Their derivatives solve the transposed system for the gradient v of a loss with respect to a:
+that g depends on. To differentiate them, let v be the gradient of a loss with respect to a, and solve the transposed
+system for p and w:
 
     p + sum lam_j hess g_j p + sum w_j grad g_j = v,    grad g_j . p = 0.
 
@@ -56,7 +57,7 @@ def differentiable_projection(solver: Solver, at: Any, action: Tensor) -> Tensor
 
 
 class _Partial(NamedTuple):
-    """A solver that takes coefficients tensor by tensor, in place of the tensors in `at`."""
+    """A solver with coefficients like `at`, but with other tensors, given one by one."""
 
     solver: Solver
     at: Any

@@ -19,7 +19,7 @@ def deflated_jacobian(curvature: Tensor, *normals: Tensor) -> JacobianProduct:
     Args:
         curvature: (..., d) diagonal of the inverse Hessian, 0 (or False) on coordinates that are held fixed.
         normals: (..., d) each, the gradient of an active constraint, 0 where it is inactive. Each removes the direction
-        that it blocks from J: J <- J - (J n)(J n)' / (n' J n).
+            that it blocks from J: J <- J - (J n)(J n)' / (n' J n).
     """
 
     def product(vector: Tensor) -> Tensor:

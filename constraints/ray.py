@@ -28,7 +28,8 @@ class Ray:
     """The ray from a centre c on which a map moves actions (..., d).
 
     The alpha and radial maps move an action on its own ray, along its offset v = action - c. The gauge map takes the
-    action itself as the offset. All results are in the action's dtype.
+    action itself as the offset. Maps and `alpha_log_prob` are in the action's dtype, the other log-densities in the
+    dtype of `log_prob`, and `gauge`, `gradient` and `log_reach` in float64.
 
     Args:
         action: (..., d) float32 or float64, before the map.
@@ -36,7 +37,7 @@ class Ray:
         offset: (..., d) float64, action - c with all leading dimensions.
         gauge_of: returns the set's gauge L (...) around c and its gradient (..., d), for offsets (..., d).
         traced: whether results are differentiated with respect to more than the action: the centre and the set's
-            coefficients. Plain autograd does that; without it, gradients are closed forms.
+            coefficients. If True, plain autograd computes the gradients; if False, they are closed forms.
     """
 
     def __init__(

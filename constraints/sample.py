@@ -73,8 +73,8 @@ def hit_and_run(
 def round_axes(oracle: Callable[[Tensor], Tensor], center: Tensor) -> Tensor:
     """Columns (..., d, d): axes in whose coordinates the set is nearly round, however thin it is.
 
-    Each axis is half the difference of the two points that are furthest apart in a direction across all earlier axes
-    (Betke and Henk 1993). For an ellipse they are conjugate semi-axes, so that it becomes the unit ball.
+    Each axis is half the difference of the two points that are furthest apart in a direction orthogonal to all earlier
+    axes (Betke and Henk 1993). For an ellipse they are conjugate semi-diameters, so that it becomes the unit ball.
     """
     dim = center.shape[-1]
     across = torch.eye(dim, dtype=center.dtype, device=center.device).expand(*center.shape, dim).clone()

@@ -27,8 +27,8 @@ class RowProblem:
     target and weight >= 0 (..., d); bound >= 0 is a number or (..., 1); top is a number.
 
     With a multiplier lam on the row, each coordinate stays at `top` until lam reaches `leave`, then falls linearly to 0
-    at `arrive` and stays there; with metric 0 it jumps. weight.a falls with lam, so the solution lies between the two
-    neighbours among the 2d breakpoints whose values of weight.a enclose the bound. The breakpoints `leave` are set just
+    at `arrive` and stays there; with metric 0 it jumps. weight.a falls with lam. Of the 2d breakpoints, two neighbours
+    have values of weight.a that enclose the bound; the solution lies between them. The breakpoints `leave` are set just
     below their exact values, so that interpolation treats a jump like a fall.
     """
 
@@ -120,8 +120,8 @@ def minimize_under_ellipse(
     the ellipse is not active.
 
     The dual function is concave in mu, so the ellipse's value falls with mu. Within a bracket, Newton's method finds
-    the mu at which it equals the bound. It solves for 1 / sqrt(value of the free coordinates), which is linear in mu
-    for a sphere. Since scale_i a_i <= target_i / mu, the multiplier is at most |target|_1 / bound.
+    the mu at which the value equals the bound. It is applied to 1 / sqrt(value of the free coordinates), which is
+    linear in mu for a sphere. Since scale_i a_i <= target_i / mu, the multiplier is at most |target|_1 / bound.
     """
     target = problem.target
     high = target.sum(-1, keepdim=True) / bound

@@ -35,9 +35,10 @@ class Weights(NamedTuple):
 
 
 class _WeightPatterns(Constraint):
-    """Rows pattern_k * weight(obs), all with the same bound, a function or a number > 0 (ValueError for others).
+    """Rows pattern_k * weight(obs), all with the same bound.
 
-    `penalty` and `explicit` write out all rows; ConstraintError if a set of 2^d rows has more than 16 coordinates.
+    The bound is a function or a number; ValueError for a number that is not positive and finite. `penalty` and
+    `explicit` write out all rows; ConstraintError if WeightedL1 or WeightedPositivePart has more than 16 coordinates.
     """
 
     def __init__(self, weight: Coefficients, bound: Bound, dim: int):
@@ -141,8 +142,8 @@ class WeightedL1(_WeightPatterns):
 class WeightedPositivePart(_WeightPatterns):
     """sum max(w_i a_i, 0) <= bound in the box: 2^d - 1 rows (R+M, H+M, W+M).
 
-    With more than 12 coordinates, `violation` of an action inside the set considers d of the rows only. It may then be
-    too low, but it is negative as it should be. Outside the set it is exact.
+    With more than 12 coordinates, `violation` of an action inside the set is computed from only d of the rows. The
+    result may be too negative, but its sign is right. Outside the set it is exact.
     """
 
     origin_centered = False
@@ -169,7 +170,7 @@ class WeightedPositivePart(_WeightPatterns):
 
     def _center(self, at: Weights) -> Tensor:
         # Among the rows of all subsets, only prefixes of the weights in descending order limit the radius. Many points
-        # have it; this one is continuous in obs.
+        # have the largest radius; this one is continuous in obs.
         weight, bound = at
         ordered = weight.abs().sort(-1, descending=True).values
         # If all weights are 0, the quotient is large and the radius is the box's.

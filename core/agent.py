@@ -214,7 +214,7 @@ class Agent(Snapshots):
         return self.map(self.constraint, obs, suggested, center)
 
     def squash(self, raw: Tensor) -> Tensor:
-        """The suggestion that the output `raw` of an actor's network stands for: its tanh if the map squashes."""
+        """Turn the output `raw` of an actor's network into a suggestion: tanh(raw) if the map squashes, else raw."""
         return raw.tanh() if self.map.squashes else raw
 
     def bounded(self, raw: Tensor) -> Tensor:
@@ -222,7 +222,7 @@ class Agent(Snapshots):
         return raw.clamp(-1.0, 1.0) if self.map.squashes else raw
 
     def proposed(self, obs: Tensor, raw: Tensor) -> Tensor:
-        """The actions, for the suggestions `raw`, whose violation training.csv logs."""
+        """The actions whose violation training.csv logs, for the suggestions `raw`."""
         return self.map.propose(self.constraint, obs, self.bounded(raw))
 
     def warm_up(self, which: Sequence[int]) -> Tensor:
@@ -232,7 +232,7 @@ class Agent(Snapshots):
     # ---------------------------------------------------------------- learning
 
     def penalty(self, obs: Tensor, suggested: Tensor) -> Tensor | float:
-        """The term (seeds, batch) of the actor loss in names with +, 0 in other names (paper, "Algorithms").
+        """The term (seeds, batch) that algorithms with + add to the actor loss; 0.0 for others (paper, "Algorithms").
 
         An algorithm that uses it sets `takes_penalty`.
         """

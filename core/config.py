@@ -131,7 +131,7 @@ class Config:
             f"must be auto or from 1 to {MOST_THREADS}",
         ),
     )
-    checkpoint_every: int = setting(10_000, "environment steps between checkpoints", AT_LEAST_ONE)
+    checkpoint_every: int = setting(10_000, "environment steps per seed between checkpoints", AT_LEAST_ONE)
     log: str = setting(
         CSV,
         "loggers: csv (the run's own files, always on), tensorboard, wandb, or both: tensorboard,wandb",

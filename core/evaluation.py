@@ -18,7 +18,8 @@ StepTogether = Callable[[Sequence[Any], np.ndarray], Sequence[Any]]
 """Steps each environment with its row of the actions (environments, d). Returns for each environment the result of its
 `step` or, for a refused action, the error that `step` raised."""
 Watch = Callable[[int], AbstractContextManager[Callable[[int], Any]]]
-"""Takes the largest number of steps of an evaluation. Returns a context around it, which yields a step counter."""
+"""Called with the largest number of steps of an evaluation. Returns a context manager that yields a function to count
+steps."""
 
 
 def refusal(error: Exception, obs: Any) -> str:

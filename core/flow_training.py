@@ -51,8 +51,8 @@ class FlowTraining:
     """Trains a flow with the settings of the map `flow`.
 
     `obs` (n, k) are observations of random play, the last `HELD_OUT` for the measures. The same arguments give the same
-    bits. The constructor calls `stop_if_asked`, which raises to stop it. It raises a ConstraintError if the constraint
-    fails at one of `obs`.
+    bits. The constructor calls `stop_if_asked`, which raises to stop it. The constructor raises a ConstraintError if
+    the constraint fails at one of `obs`.
     """
 
     def __init__(
@@ -97,8 +97,8 @@ class FlowTraining:
         """Draw an action (n, d), uniform in its set, for each of obs (n, k).
 
         It is the first feasible one of `TRIES` draws from the box, which is much faster than `Constraint.sample`; only
-        if there is none, `Constraint.sample` draws it. If the set is empty, it is the projection of a draw, which has
-        the least violation.
+        if there is none, `Constraint.sample` draws it. If the set is empty, a draw is projected to the actions with the
+        least violation.
         """
         actions = []
         for chunk in obs.split(_CHUNK):

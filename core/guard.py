@@ -17,7 +17,7 @@ from constraints.ray import Ray
 from core.evaluation import StepTogether, refusal
 
 Rows = Sequence[int] | None
-"""For each row of a batch, the row that is used in its place; None if each row stands for itself."""
+"""For each row of a batch, the index of the row used instead; None if no row is replaced."""
 
 
 class Guard:

@@ -66,11 +66,11 @@ class Map(ABC):
         return constraint.alpha_map(obs, action, center)
 
     def limit_target(self, constraint: Constraint, obs: Tensor, action: Tensor, center: Tensor | None) -> Tensor:
-        """Map TD3's target action with noise (..., d) back to the actions on which the critic is trained."""
+        """Map TD3's noisy target action (..., d) back to the kind of actions on which the critic is trained."""
         return self.pull_back(constraint, obs, action, center)
 
     def configured(self, config: Config) -> Map:
-        """A copy of the map whose fields have their values in `config`."""
+        """A copy of the map; fields that `config` has too get its values."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
         changed = {name: getattr(config, name) for name in own if getattr(config, name, own[name]) != own[name]}
         # With unchanged settings, the copy keeps what the map has learned. With others, it starts untrained.

@@ -50,7 +50,10 @@ class Moments:
                     seed.checkpoints.discard()
 
     def restore(self, checkpoints: Sequence[Checkpoint], obs: Tensor, center: Tensor | None) -> None:
-        """Restore the moment of `checkpoints`, one of each seed. Copy its observations and centres to obs, `center`."""
+        """Restore the moment of `checkpoints`, one of each seed.
+
+        Copy its observations and centres into `obs` and `center`.
+        """
         states = [checkpoint.state() for checkpoint in checkpoints]
         # Everything is read before anything is written. A read error thus leaves every folder as it is.
         for seed, checkpoint, state in zip(self.seeds, checkpoints, states, strict=True):

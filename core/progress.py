@@ -75,7 +75,7 @@ class Progress:
             yield bar.update
 
     def advance(self, count: int, step: int) -> None:
-        """Count `count` environment steps. `step` is the step of the slowest seed before them."""
+        """Count an environment step of `count` seeds. `step` is the smallest step of these seeds before the count."""
         if self.bars and step >= self.warm_up:
             self.bar.close()
             self.bar = self._next_bar()

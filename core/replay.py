@@ -69,7 +69,10 @@ class Replay:
         return self._rows
 
     def add(self, which: Sequence[int], transitions: Batch) -> None:
-        """Append a transition to each seed in the positions `which`. All columns are (seeds, features), rewards too."""
+        """Append a transition to each seed in the positions `which`.
+
+        All columns are (seeds, features); `reward` and `terminated` are (seeds, 1).
+        """
         which = list(which)
         rows = torch.cat([column for column in transitions if column is not None], dim=-1)
         self.waiting.append(rows if which == self.everyone else rows[which])

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 EVERY = 10
-"""Every this many environment steps of a seed, one is measured. That takes a few percent of a step's time on a GPU."""
+"""One in this many environment steps of a seed is measured. That takes a few percent of a step's time on a GPU."""
 
 
 @dataclass

@@ -75,9 +75,9 @@ class Trainer:
     def run(self) -> list[dict | None]:
         """Train every seed to the end. Returns one result per seed, None for a seed that diverged.
 
-        Before an Interrupted is raised, a checkpoint is written. Any exception saves the last parameters. An error that
-        belongs to one seed ends that seed alone (`failed.json` has the step and the reason). Any other error is raised
-        after a line on stderr that names algorithm, task and step.
+        If `stop_if_asked` raises Interrupted, a checkpoint is written before it is raised again. Any exception saves
+        the last parameters. An error that belongs to one seed ends that seed alone (`failed.json` has step and reason).
+        Any other error is raised after a line on stderr that names algorithm, task and step.
         """
         self.progress = Progress(self.config, [seed.steps for seed in self.seeds], self.show_progress)
         self.evaluator.watch = self.progress.evaluation
@@ -180,7 +180,7 @@ class Trainer:
             for seed in live:
                 seed.owed -= 1
                 seed.gradient_steps += 1
-            # Reading losses waits for the GPU, so it is done when a seed owes no more. An infinite loss stays infinite.
+            # Reading losses waits for the GPU: do it only if a seed has no gradient steps left. Infinite ones stay so.
             if self.agent.device.type == "cpu" or not all(seed.owed for seed in live):
                 for i, quantity in self.agent.diverged().items():
                     self._fail(self.seeds[i], f"{quantity} is not finite")

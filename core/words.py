@@ -19,7 +19,7 @@ class ConfigError(ValueError):
 
 
 class NameTable(MutableMapping[str, Row]):
-    """A dict whose keys are names on command lines and in run folders; `kind`, such as "task", is for messages.
+    """A mapping whose keys are names on command lines and in run folders; `kind`, such as "task", is for messages.
 
     Raises ValueError for a name that is taken, because it identifies runs, and for a name that cannot be used as a
     word, in a comma list and in a folder's name. `del` frees a name.
@@ -34,7 +34,7 @@ class NameTable(MutableMapping[str, Row]):
             article = "an" if self.kind[0] in "aeiou" else "a"
             raise ValueError(
                 f"{name!r} cannot be the name of {article} {self.kind}: a name has no space, comma, '=' or slash, does"
-                f" not begin with '.', and is none of {', '.join(GROUPS)}"
+                f" not begin with '.', and is not one of the words {', '.join(map(repr, GROUPS))}"
             )
         self._rows[name] = row
 
@@ -64,7 +64,11 @@ class NameTable(MutableMapping[str, Row]):
 
 
 def known_name(kind: str, value: object, choices: Iterable[str]) -> str:
-    """Return `value` if it is one of `choices`. Otherwise raise a ConfigError with the closest, or with all."""
+    """Return `value` if it is one of `choices`; otherwise raise a ConfigError.
+
+    The message names the closest choice, if one is similar. It lists all choices if none is similar, or if they are at
+    most `FEW`.
+    """
     choices, text = list(choices), str(value)
     if text in choices:
         return text

@@ -41,8 +41,8 @@ def check_robot(robot: type[Robot], steps: int = 200) -> None:
 
     The check plays several episodes of at most `steps` steps with random actions in [-1, 1], many of them at -1 or 1.
     It tests the attributes, shapes and types of the protocol. Equal random numbers and actions must give equal bits: in
-    two robots side by side, after other episodes, from a saved state, and in `step_together`. The robot must copy the
-    arrays that it is given and those that it returns.
+    two robots side by side, after other episodes, from a saved state, and in `step_together`. The robot must not change
+    an array that it is given, and must not keep one that it is given or returns; it must copy it first.
     """
     check_class(robot)
     steps = min(steps, robot.max_episode_steps)

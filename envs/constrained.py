@@ -32,8 +32,8 @@ class InfeasibleActionError(ValueError):
 def allowed_violation(constraint: Constraint, obs: torch.Tensor, violation: float) -> torch.Tensor:
     """The largest violation (...) that an executed action may have at obs (..., n).
 
-    `violation` is the largest one of the actions in question. Up to 1e-6, the least possible violation need not be
-    computed.
+    `violation` is the largest violation among the actions to check. If it is at most 1e-6, the least possible violation
+    is not computed.
     """
     if violation > TOLERANCE and constraint.on_empty == "least":
         return TOLERANCE + constraint.least_violation(obs).double()
@@ -96,7 +96,10 @@ def step_together(envs: Sequence[ActionConstrainedEnv], actions: Sequence[np.nda
 
 
 def _all_well_formed(envs: Sequence[ActionConstrainedEnv], actions: Any) -> bool:
-    """Fast test whether all actions are well-formed and all environments ready; only False may be wrong."""
+    """Fast test whether all actions are well-formed and all environments ready.
+
+    True is always right; False may be wrong.
+    """
     if not envs or not isinstance(actions, np.ndarray) or actions.shape != (len(envs), envs[0].constraint.dim):
         return False
     return all(env._obs is not None for env in envs) and bool(np.isfinite(actions).all())

@@ -86,7 +86,7 @@ class Tasks(NameTable[Task]):
         if not isinstance(name, str) or not re.fullmatch(r"[^\W_][\w+.-]*", name) or name.lower() in _NOT_NAMES:
             raise ValueError(
                 f"bad name {name!r} for a task: expected letters, digits and + - _ . with a letter or a digit first,"
-                f" and none of {', '.join(sorted(_NOT_NAMES))}"
+                f" and not one of the words {', '.join(map(repr, sorted(_NOT_NAMES)))}"
             )
         if not isinstance(task, Task):
             raise TypeError(f"the row {name} of envs.TASKS must be an envs.Task, got {task!r}")

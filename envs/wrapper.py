@@ -89,7 +89,7 @@ class Constrained(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return obs, info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Execute the feasible action that the mapping makes of `action` (d,); return what the environment returns.
+        """Map `action` (d,) to a feasible action and execute it; return what the environment returns.
 
         Raises gymnasium.error.ResetNeeded before the first reset, and InfeasibleActionError as the class says.
         """

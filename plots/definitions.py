@@ -55,7 +55,7 @@ def hyperparameter_table() -> Table:
 def _configurations() -> dict[tuple[str, str], dict[str, Any]]:
     """All settings by group of robots and family of algorithms.
 
-    An algorithm that differs from earlier ones of its family in a value gets a column under its own name.
+    An algorithm gets its own column if one of its values differs from an earlier algorithm of its family.
     """
     columns: dict[tuple[str, str], dict[str, Any]] = {}
     for group in dict.fromkeys(group for algorithm in ALGORITHMS.values() for group in algorithm.agent.paper):

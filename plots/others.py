@@ -46,8 +46,8 @@ class Source(NamedTuple):
 def parse_sources(words: Sequence[str]) -> list[Source]:
     """The sources that words `PATH` or `PATH=LABEL` name.
 
-    Every source but the first must have a label; by default it is the name of the folder or file. Raises ConfigError
-    for an invalid label and for two equal labels.
+    Every source but the first has a label: the given one or, by default, the name of the folder or file. Raises
+    ConfigError for an invalid label and for two equal labels.
     """
     sources: list[Source] = []
     for word in words:
@@ -59,8 +59,8 @@ def parse_sources(words: Sequence[str]) -> list[Source]:
             label = path.resolve().stem if path.is_file() else path.resolve().name
         if label is not None and (label == RESERVED or not re.fullmatch(r"[^\s()]([^()]*[^\s()])?", label)):
             raise ConfigError(
-                f"bad label {label!r} for {path}: expected PATH=LABEL with a label that has no brackets and is not"
-                f" {RESERVED!r}"
+                f"bad label {label!r} for {path}: expected PATH=LABEL with a label that is not empty, has no"
+                f" parentheses and no spaces at its ends, and is not {RESERVED!r}"
             )
         if label and label in (source.label for source in sources):
             raise ConfigError(f"two folders have the label {label!r}: give {path} another one with {path}=LABEL")

@@ -31,16 +31,19 @@ OWN_COLORS = (
     "#d2a679",
 )
 OWN_LINES = ("dashdot", "dotted", (0, (5, 1, 1, 1, 1, 1)))
-"""Colours and line styles of the user's own algorithms, which take them in turn."""
+"""Colours and line styles of the algorithms of `own_algos`, which take them in turn."""
 
 
 def own_algos(algos: Iterable[str]) -> list[str]:
-    """The user's own algorithms among `algos`, sorted: the argument `own` of `color_of` and `line_of`."""
+    """The algorithms among `algos` that are not in `COLORS` or `LATER`, sorted: `own` of `color_of` and `line_of`.
+
+    They are the user's own and those of sources with a label (`plots.others`).
+    """
     return sorted({algo for algo in algos if algo not in COLORS and algo not in LATER})
 
 
 def color_of(algo: str, own: Sequence[str]) -> str:
-    """The colour of `algo`; `own` are all of the user's own algorithms in the results (`own_algos`)."""
+    """The colour of `algo`; `own` is what `own_algos` returns for all algorithms in the results."""
     return (COLORS | LATER).get(algo) or OWN_COLORS[own.index(algo) % len(OWN_COLORS)]
 
 

@@ -162,8 +162,8 @@ class CheckpointFolder:
                 content = load_tensors(path)
                 if content.get("format") != FORMAT:
                     raise FormatError(
-                        f"{path} was written by another version of this code, and this version cannot resume it;"
-                        " overwrite=true starts the run again and keeps the old one; or leave out its seed in seed="
+                        f"{path} was written by another version of this code and cannot be resumed: use overwrite=true"
+                        " to start again and keep the old run, or leave its seed out of seed="
                     )
                 files = tuple(ReplayFile(*file) for file in content["replay_files"])
                 for file in files:

@@ -24,9 +24,9 @@ class Interrupted(Exception):
 class Interrupts:
     """While this context is open, the first of SIGNALS is only recorded; `stop_if_asked` then raises Interrupted.
 
-    A second signal has its usual effect: it ends the process at once. It is ignored within SAME_EVENT of the first one,
-    and if it is SIGHUP, which a closing terminal repeats. In a thread other than the main one, where Python allows no
-    handlers, signals keep their usual effect.
+    A second signal ends the process at once, as usual. Signals within SAME_EVENT seconds of the first are ignored, and
+    so is every later SIGHUP, which a closing terminal repeats. In a thread other than the main one, where Python allows
+    no handlers, signals keep their usual effect.
     """
 
     def __init__(self) -> None:

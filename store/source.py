@@ -41,7 +41,7 @@ def source_of(value: types.FunctionType | type) -> str:
     try:
         if value.__name__ == "<lambda>":
             return _lambda_source(value)
-        # For a function made by a decorator, `__code__` leads to the source of the wrapper, and the function itself to
+        # If a decorator made the function, `__code__` gives the source of the wrapper; the function itself would give
         # the source of the decorated function.
         return _bare(textwrap.dedent(inspect.getsource(getattr(value, "__code__", value))))
     except (OSError, TypeError, SyntaxError, IndentationError, tokenize.TokenError):

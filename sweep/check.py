@@ -58,7 +58,10 @@ def _check_projection(task: str, constraint: Constraint, action_dim: int, obs: T
             raise ValueError(f"it is for {constraint.dim} action coordinates, but the robot has {action_dim}")
         action = constraint.project(obs, torch.ones(1, constraint.dim))
         if action.shape != (1, constraint.dim) or not _is_allowed(constraint, obs, action):
-            raise ValueError(f"it projects (1, ..., 1) to {action.tolist()}, which is not a feasible action")
+            raise ValueError(
+                f"at a first observation of the robot, it projects (1, ..., 1) to {action.tolist()}, which is not a"
+                " feasible action"
+            )
     except Exception as error:  # the constraint may be the user's own code
         raise ConfigError(f"the constraint of {task} does not work: {one_line(error)}") from error
 

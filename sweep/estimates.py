@@ -130,7 +130,7 @@ def corrections(runs: Iterable[Run], device: str) -> dict[tuple[str, str], float
 
 
 def correct(corrections: Mapping[tuple[str, str], float], task: str, algo: str) -> float:
-    """The correction from the cell's own finished runs; without any, the median over all cells."""
+    """The correction from the cell's own finished runs; without any, the median over all finished runs."""
     return corrections.get((task, algo), corrections.get(("", ""), 1.0))
 
 

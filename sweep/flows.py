@@ -1,7 +1,8 @@
 """The normalising flow of a cell's map: trained once for a task and its settings, then shared by all seeds.
 
     results/flows/<task>/<flow>-<checksum>/
-        settings.json    the settings of the flow and the definition of the task; the checksum is that of this file
+        settings.json    the settings of the flow and the definition of the task; `<checksum>` in the folder's name is
+                         the checksum of this file
         training.csv     step, seconds, and the measures of `core.flow_training` at that step
         checkpoint.pt    while the training is unfinished
         flow.pt          the parameters, the measures and where they come from; written last, so its presence means that

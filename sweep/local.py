@@ -118,7 +118,7 @@ def run_queue(entries: Sequence[Entry], jobs: int, stop_if_asked: Callable[[], N
         first = elsewhere[0]
         print(
             f"{len(elsewhere)} cell{'s' * (len(elsewhere) > 1)} skipped because another process or job trains"
-            f" {'them' if len(elsewhere) > 1 else 'it'}"
+            f" {'them' if len(elsewhere) > 1 else 'it'}, or may do so"
             f" (`run.py status {first.cell.root}` shows all):"
             f" {first.cell.name} seed={format_seeds(first.cell.seeds)} is {first.state.describe()}"
             + (" ..." if len(elsewhere) > 1 else ""),

@@ -92,7 +92,7 @@ class Display:
         bar.refresh()
 
     def _eta(self, running: Mapping[Entry, float], shares: Mapping[Entry, float]) -> float:
-        """Seconds until the end, if the rest deviates from its estimates as the processes so far do."""
+        """Seconds until the end, if the rest takes longer or shorter than estimated by the same factor as so far."""
         left = {entry: entry.seconds(0) * (1.0 - share) for entry, share in shares.items()}
         done = sum(max(0.0, entry.remaining - left[entry]) for entry in running)
         took, estimated = self.seconds + sum(running.values()), self.estimated + done

@@ -97,6 +97,6 @@ def _check_values(sweep: Sweep, slurm_keys: Sequence[str]) -> None:
     if 3600 * slurm.hours <= 2 * SIGNAL_DELAY and "signal" not in sweep.sbatch:
         # The signal would come before the training has made progress, again and again.
         raise ConfigError(
-            f"bad value {slurm.hours} for slurm.hours: must be more than {2 * SIGNAL_DELAY} seconds, because a cell"
-            f" writes its checkpoint {SIGNAL_DELAY} seconds before the end; slurm.signal= can change this"
+            f"bad value {slurm.hours} for slurm.hours: must be more than {2 * SIGNAL_DELAY} s (the checkpoint is"
+            f" written {SIGNAL_DELAY} s before the end; slurm.signal= changes that)"
         )

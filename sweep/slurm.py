@@ -67,9 +67,10 @@ def check_gpus(sweep: Sweep, device: str) -> None:
 
 
 def submit(sweep: Sweep, cells: Sequence[Cell]) -> None:
-    """Submit the cells that are neither finished nor queued nor running.
+    """Submit the cells that have not ended and that no process or job trains or may train.
 
-    Raises ConfigError if Slurm or submitit is missing, and if sbatch refuses the jobs.
+    Raises ConfigError if Slurm or submitit is missing, squeue does not answer, another command is submitting, or sbatch
+    refuses the jobs.
     """
     if not shutil.which("sbatch"):
         raise ConfigError("launcher=slurm needs Slurm: there is no sbatch on the PATH")
@@ -214,7 +215,7 @@ class Job:
 
 
 def _is_running(job: str) -> bool:
-    """Whether Slurm still runs `job`, so that its signal meant the time limit or a preemption and no cancellation.
+    """Whether Slurm still runs `job`. If so, its signal meant the time limit or a preemption, not a cancellation.
 
     A cancelled job must not come back, although Slurm would allow it. If squeue gives no answer for PATIENCE seconds,
     the job was not cancelled, because Slurm would have killed it by then.

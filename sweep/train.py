@@ -40,8 +40,8 @@ def train_words(words: str) -> bool:
     """Train the cells that `words` ask for, as `python run.py <words>` does, one after the other in this process.
 
     Returns whether every seed has a result; a seed that diverged has none. Ctrl-C writes a checkpoint and ends the
-    program; the same call resumes. Raises ConfigError for wrong words, ConstraintError for a constraint that breaks
-    down and LockedError if another process trains a run.
+    program; the same call resumes. Raises ConfigError for wrong words, ConstraintError for a constraint that fails and
+    LockedError if another process trains a run.
     """
     refuse_to_train_in_plugin()
     cells = make_cells(parse_words(load_plugins(words.split()), setting_keys()))

@@ -117,7 +117,7 @@ def test_a_coefficient_of_a_subclass_is_a_method():
 @pytest.mark.parametrize("base", [Ball, QuadraticConstraint, HalfSpace])
 def test_methods_that_others_bypass_are_not_overridden(base, name):
     """Training reads the stored `center`, evaluation reads `_center`: an override of one would part the two."""
-    with pytest.raises(TypeError, match=f"^Mine overrides {name}, which some calls would bypass: override _center"):
+    with pytest.raises(TypeError, match=f"^Mine overrides {name}, but some calls would bypass that: override _center"):
         type("Mine", (base,), {name: lambda self, obs: obs})
 
 
@@ -152,9 +152,9 @@ def test_a_centre_outside_the_set(name, method):
     for outside in (torch.tensor([0.8, 0.9]), torch.tensor([[0.0, 0.0], [1.5, 0.0]]), torch.ones(2)):
         if constraint.contains(obs, outside).all():
             continue
-        with pytest.raises(ConstraintError, match="sample.*: the center is not inside the set"):
+        with pytest.raises(ConstraintError, match="sample.*: the centre is not inside the set"):
             getattr(constraint, method)(obs, action, outside)
-    with pytest.raises(ValueError, match=r"expected 2 coordinates of the center, got shape \(1,\)"):
+    with pytest.raises(ValueError, match=r"expected 2 coordinates of the centre, got shape \(1,\)"):
         getattr(constraint, method)(obs, action, torch.zeros(1))
     getattr(constraint, method)(obs, action, torch.zeros(2))
 
@@ -191,7 +191,7 @@ def test_given_centres_too_are_checked_in_the_first_calls_unless_more_is_asked_f
     constraint.alpha_map(obs, action, outside)
     check_inputs(True)
     try:
-        with pytest.raises(ConstraintError, match="the center is not inside the set"):
+        with pytest.raises(ConstraintError, match="the centre is not inside the set"):
             constraint.alpha_map(obs, action, outside)
     finally:
         check_inputs(False)
@@ -399,5 +399,5 @@ def test_the_own_centre_of_a_very_thin_set_is_inside():
     direction, center = torch.ones(3, 2, dtype=torch.float64), constraint.center(obs)
     assert torch.isfinite(constraint.gauge(obs, direction, center)).all()
     center[0, 0] = 0.01
-    with pytest.raises(ConstraintError, match="sample 0: the center is not inside the set"):
+    with pytest.raises(ConstraintError, match="sample 0: the centre is not inside the set"):
         constraint.gauge(obs, direction, center)

@@ -103,7 +103,7 @@ def test_settings_of_a_sweep_are_no_settings_of_its_runs():
         ("launcher=slurm slurm.cpus=x", "bad value 'x' for slurm.cpus: expected int"),
         ("launcher=slurm slurm.cpus=0", "bad value 0 for slurm.cpus: must be at least 1"),
         ("launcher=slurm slurm.hours=0", "bad value 0.0 for slurm.hours"),
-        ("launcher=slurm slurm.hours=0.06", "bad value 0.06 for slurm.hours: must be more than 240 seconds"),
+        ("launcher=slurm slurm.hours=0.06", "bad value 0.06 for slurm.hours: must be more than 240 s ("),
         ("launcher=slurm slurm.hours=nan", "bad value nan for slurm.hours"),
         ("launcher=slurm slurm.=1", "expected key=value"),
         ("launcher=slurm device=cuda", "device=cuda with launcher=slurm needs slurm.gpus= of at least 1"),

@@ -1,7 +1,7 @@
 """Exact projection on polyhedra, in batch, by the dual active-set method of Goldfarb and Idnani (1983).
 
 It starts at the point itself, adds the most violated row and drops rows whose multiplier would turn negative. It
-therefore needs no interior, ends after finitely many steps, is exact to rounding, and proves when a set is empty.
+therefore needs no interior, ends after finitely many steps, is exact to rounding, and can prove that a set is empty.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def project_on_rows(
     """Closest point (n, d) to target (n, d) with rows (n, m, d) @ a <= bounds (n, m), and its multipliers (n, m).
 
     Rows have unit norm or are 0. The rows with a positive multiplier are linearly independent. An EmptySetError names a
-    sample whose set is empty and, among the first `named` rows, one that takes part in the conflict.
+    sample whose set is empty, and a row in conflict if one of the first `named` rows is.
     """
     count, m, dim = rows.shape
     multipliers, solution = torch.zeros_like(bounds), target.clone()

@@ -80,7 +80,7 @@ class GeneralConstraint(Constraint):
         check_observation(obs)
         at = self.at(obs.double())
         sets = scale_sets(at.written, at.lead, check=False)
-        # Every action violates a row 0 <= b by -b.
+        # A zero row reads 0 <= b. Every action violates it by -b.
         fixed = torch.where(sets.solid, 0.0, -sets.bounds).amax(-1)
         return torch.maximum(least_excess(sets), fixed).clamp(min=0.0).view(at.lead).to(obs)
 
@@ -138,7 +138,7 @@ class GeneralConstraint(Constraint):
         lead = tuple(direction.shape[:-1])
         sets = widened(scale_sets(at.written, lead, check=False), flat=True)
         middle = torch.zeros_like(direction) if center is None else center
-        require(sets.depth(middle.reshape(-1, self.dim).cpu()) > 0.0, "the centre is not interior", sets.name)
+        require(sets.depth(middle.reshape(-1, self.dim).cpu()) > 0.0, "the centre is not inside the set", sets.name)
         along, offset = direction.reshape(-1, 1, self.dim).cpu(), middle.reshape(-1, 1, self.dim).cpu()
         slack = sets.bounds - times(sets.rows, offset.squeeze(1))
         first = (times(sets.rows, along.detach().squeeze(1)) / slack).argmax(-1, keepdim=True)
@@ -217,8 +217,8 @@ class GeneralConstraint(Constraint):
     ) -> tuple[ScaledSets, Result]:
         """The sets of a batch of shape `lead`, and the result of `solve` on them.
 
-        With `on_empty="least"`, widened sets replace empty ones. `interior` says whether `solve` needs an interior even
-        without ellipses; with ellipses, sets without interior are always widened too.
+        With `on_empty="least"`, widened sets replace empty ones. `interior`: also widen sets without interior. With
+        ellipses, this is always done.
         """
         try:
             sets = scale_sets(at.written, lead)

@@ -13,9 +13,11 @@ from constraints.general.projection import closest_points
 from constraints.general.scaled_sets import NO_INTERIOR, ScaledSets, guessed_points
 from constraints.numerics import times
 
-# A centre is at least this share as deep as the deepest point. Larger shares leave less room for continuity.
+# A centre is at least this share as deep as the deepest point. With a larger share, the centre moves faster when
+# the set changes.
 _DEEP = 0.9
-# A guess less deep than this and than half of the largest depth gives way to a point that is nearly the deepest.
+# A guess less deep than this, and less deep than half of the largest depth, gives way to a point that is nearly the
+# deepest.
 _SHALLOW = 1e-2
 # In a set that is nowhere deeper than this, the deepest point is taken: too little room is left beside it.
 _THIN = 1e-6

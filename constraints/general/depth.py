@@ -48,7 +48,10 @@ def deepest_on_rows(sets: ScaledSets, box: bool = True) -> tuple[Tensor, Tensor]
 
 
 def deepest_points(sets: ScaledSets) -> Tensor:
-    """Points (n, d) of largest `depth` in sets with ellipses. EmptySetError if a set is empty or has no interior."""
+    """Points (n, d) of largest `depth` in sets with ellipses.
+
+    Raises EmptySetError if a set is empty or has no interior, and ConstraintError if the interior-point method fails.
+    """
     solution, converged = _deepest_in_cones(sets, box=True)
     point = solution[:, :-1]
     deep = sets.depth(point) > NO_INTERIOR
@@ -88,7 +91,7 @@ def _deepest_in_cones(sets: ScaledSets, box: bool) -> tuple[Tensor, Tensor]:
 def least_excess(sets: ScaledSets) -> Tensor:
     """The least excess (n,) over rows and ellipses of the points in the box, negative if some point is inside.
 
-    Rows 0 <= b do not count. If nothing else is left, the result is -1.
+    Zero rows do not count. If nothing else is left, the result is -1.
     """
     sets = replace(sets, bounds=torch.where(sets.solid, sets.bounds, 1.0))
     bounded = (sets.solid & sets.given).any(-1) | (sets.matrix.shape[1] > 0)
@@ -105,8 +108,8 @@ def widened(sets: ScaledSets, flat: bool) -> ScaledSets:
     """The sets, with rows and ellipses (not the box) moved outwards by one common distance where a set is empty.
 
     `flat` widens sets without interior too. The distance is the least that gives a set an interior of depth `_ROOM`, so
-    its points violate the constraint by no more than the least possible violation plus `_ROOM`. A row 0 <= b < 0 is
-    dropped, because no action satisfies it.
+    its points violate the constraint by no more than the least possible violation plus `_ROOM`. A zero row with b < 0
+    is dropped, because no action satisfies it.
     """
     excess = least_excess(sets)
     growth = torch.where(excess > (-_ROOM if flat else NO_INTERIOR), excess * (1.0 + _SHARE) + _ROOM, 0.0)

@@ -24,7 +24,7 @@ class Intersection(GeneralConstraint):
     `center` is continuous in the coefficients. If all parts are linear, it is the centre of a LinearConstraint with all
     their rows. With an ellipse, it is the origin if that is well inside the set. Otherwise it is the point nearest to
     the origin among those at least 0.9 times as deep as the deepest, or a mean of both if the origin is near the
-    boundary.
+    boundary. (For a single ellipse without rows, its centre takes the origin's place.)
 
     Methods raise the ConstraintErrors of LinearConstraint and QuadraticConstraint. `on_empty` applies to the whole set;
     the `on_empty` of a part is ignored.
@@ -76,7 +76,7 @@ class Intersection(GeneralConstraint):
             # The closed forms do not check the centre.
             if not isinstance(part, GeneralConstraint) and center is not None:
                 inside = part._violation(own, center) < -ON_BOUNDARY
-                require(inside.flatten(), "the centre is not interior", name_samples(tuple(inside.shape)))
+                require(inside.flatten(), "the centre is not inside the set", name_samples(tuple(inside.shape)))
             gradients.append(part._gauge_and_gradient(own, direction, center)[1])
         return gradients
 

@@ -18,9 +18,9 @@ from constraints.numerics import safe_sqrt, times
 class LinearConstraint(GeneralConstraint):
     """A(obs) a <= b(obs) in the box [-1, 1]^dim.
 
-    Pass A and b as functions, or override them in a subclass; TypeError if one is missing. `center` is the point
-    nearest to the origin among those at least 0.9 times as deep as the Chebyshev centre. It is unique, continuous in A
-    and b, and 0 in coordinates that no row uses.
+    Pass A and b as functions, or override them in a subclass; if one is missing, its first use raises a TypeError.
+    `center` is the point nearest to the origin among those at least 0.9 times as deep as the Chebyshev centre. It is
+    unique, continuous in A and b, and 0 in coordinates that no row uses.
 
     Methods raise a ConstraintError for NaN or infinite observations or coefficients, wrong shapes and an empty set.
     `center` and methods that need a centre also raise it for a set without interior. The error names the sample and, if

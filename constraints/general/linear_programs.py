@@ -31,8 +31,8 @@ def maximize_on_rows(
 ) -> tuple[Tensor, Tensor]:
     """argmax (n, k) of <slope, y> subject to rows (n, m, k) @ y <= bounds (n, m), and multipliers (n, m).
 
-    `slope` (n, k) is of order 1. `basis` (n, k) are indices of rows of which `slope` is a sum with weights >= 0. Rows,
-    errors and the other arguments are as in `project_on_rows`.
+    `slope` (n, k) is of order 1. `basis` (n, k) are indices of k rows; `slope` must be a sum of these rows with weights
+    >= 0. Rows, errors and the other arguments are as in `project_on_rows`.
     """
     solution, multipliers, solved = _dual_simplex(rows, bounds, slope, basis)
     left = (~solved).nonzero().squeeze(-1)

@@ -1,8 +1,8 @@
 """Projection on sets of rows and ellipses, and the linear oracle of sets with ellipses.
 
 - On rows alone: a dual active-set method, exact to rounding. It is faster than a loop over OSQP, and stays exact for
-  points far away, where OSQP stops converging. Only rows whose coefficients differ by a factor of 1e10 lose digits
-  there: their error is up to 1e-9 times the distance.
+  points far away, where OSQP stops converging. Only a row whose own coefficients differ by a factor of 1e10 loses
+  digits there: the error is up to 1e-9 times the distance.
 - With ellipses: Newton's method, which finds the active constraints of most samples. If it fails, an interior-point
   method finds them, and Newton's method runs again, exact to rounding. If that fails too, sequential quadratic
   programming with the active-set method starts from the deepest point.
@@ -68,7 +68,8 @@ def optimal_points(sets: ScaledSets, aim: Tensor, linear: bool) -> tuple[Tensor,
     solution, exact, done = _newton(sets, target, point, multipliers)
     left = (~done).nonzero().squeeze(-1)
     if len(left) > 0:
-        # Start from the deepest point, as a start near the boundary may be the cause. This needs an interior.
+        # Start from the deepest point, as a start near the boundary may be the cause. A set without interior raises an
+        # EmptySetError here.
         part = sets[left]
         inside = deepest_points(part)
         target, point, multipliers = _near_optimum(part, aim[left], linear, inside)
@@ -108,8 +109,8 @@ def _minimize_quadratic(sets: ScaledSets, start: Tensor, curvature: Tensor, grad
 def _first_guess(sets: ScaledSets, target: Tensor) -> tuple[Tensor, Tensor]:
     """A point (n, d) near the projection of the target (n, d), and a guess of the multipliers (n, m + k).
 
-    The target is clamped to the box, then moved towards the centre of the ellipse that it exceeds most, onto that
-    ellipse.
+    The target is clamped to the box, then moved towards the centre of the ellipse whose bound it exceeds most, onto
+    that ellipse.
     """
     point = target.clamp(-1.0, 1.0)
     value = sets.ellipse_values(point)[0]

@@ -20,10 +20,10 @@ Coefficient = Callable[[Tensor], Tensor]
 class QuadraticConstraint(GeneralConstraint):
     """(a - c(obs))' Q(obs) (a - c(obs)) <= bound(obs) in the box [-1, 1]^dim, Q positive semi-definite, bound > 0.
 
-    Pass Q, bound (a function or a number) and c (default: the origin), or override them in a subclass; TypeError if Q
-    or bound is missing. `center` is c if that is well inside the box. If c is outside, it is the point nearest to c
-    among those at least 0.9 times as deep in the set as the deepest; if c is near the box's boundary, it is a mean of
-    both. It is continuous in the coefficients.
+    Pass Q, bound (a function or a number) and c (default: the origin), or override them in a subclass; if Q or bound is
+    missing, its first use raises a TypeError. `center` is c if that is well inside the box. If c is outside, it is the
+    point nearest to c among those at least 0.9 times as deep in the set as the deepest; if c is near the box's
+    boundary, it is a mean of both. It is continuous in the coefficients.
 
     Methods raise a ConstraintError that names the sample for NaN or infinite observations or coefficients, wrong
     shapes, a Q that is not positive semi-definite, a bound that is not positive, and an empty set. A set has no

@@ -116,7 +116,10 @@ class ScaledSets:
 
 
 def scale_sets(written: ExplicitSet, lead: tuple[int, ...], check: bool = True) -> ScaledSets:
-    """The sets of a batch of shape `lead`. With `check`, EmptySetError for a row that no point of the box satisfies."""
+    """The sets of a batch of shape `lead`.
+
+    With `check`, an EmptySetError names a row that no point of the box satisfies.
+    """
     rows, bounds = unit_rows(written.rows, written.bounds)
     m, d = rows.shape[-2:]
     count = math.prod(lead)

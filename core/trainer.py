@@ -180,7 +180,7 @@ class Trainer:
             for seed in live:
                 seed.owed -= 1
                 seed.gradient_steps += 1
-            # Reading losses waits for the GPU: do it only if a seed has no gradient steps left. Infinite ones stay so.
+            # Reading losses waits for the GPU: do it only if a seed owes no more. An infinite loss stays infinite.
             if self.agent.device.type == "cpu" or not all(seed.owed for seed in live):
                 for i, quantity in self.agent.diverged().items():
                     self._fail(self.seeds[i], f"{quantity} is not finite")

@@ -72,9 +72,7 @@ class PublishedRun:
 
 def published_cells(root: str | Path) -> list[tuple[str, str]]:
     """Task and algorithm of every run in `root`."""
-    cells = (
-        (path.parent.name, row["algo"]) for path in sorted(Path(root).glob(f"*/{RUNS}")) for row in _read_table(path)
-    )
+    cells = ((folder.name, row["algo"]) for folder in _task_folders(root) for row in _read_table(folder / RUNS))
     return list(dict.fromkeys(cells))
 
 
@@ -83,9 +81,9 @@ def read_published(
 ) -> list[PublishedRun]:
     """The runs in `root`, of the given tasks and algorithms. Raises a ValueError that names a corrupt file."""
     runs = []
-    for path in sorted(Path(root).glob(f"*/{RUNS}")):
-        if tasks is None or path.parent.name in tasks:
-            runs += [run for run in _read_task(path.parent) if algos is None or run.run.algo in algos]
+    for folder in _task_folders(root):
+        if tasks is None or folder.name in tasks:
+            runs += [run for run in _read_task(folder) if algos is None or run.run.algo in algos]
     return runs
 
 
@@ -124,6 +122,11 @@ def _training_rows(run: PublishedRun) -> list[dict[str, Any]]:
     ]
 
 
+def _task_folders(root: str | Path) -> list[Path]:
+    """The folders in `root` with published runs, also if one of their files is missing: to read it is then an error."""
+    return sorted({path.parent for name in (RUNS, EVALUATIONS) for path in Path(root).glob(f"*/{name}")})
+
+
 def _read_task(folder: Path) -> list[PublishedRun]:
     evaluations = _by_run(folder / EVALUATIONS, _evaluations)
     training = _by_run(folder / TRAINING, _columns)
@@ -145,8 +148,28 @@ def _read_task(folder: Path) -> list[PublishedRun]:
                 result=end if row["state"] == "finished" else None,
                 failure=end if row["state"] == "failed" else None,
             )
-        runs.append(PublishedRun(run, info))
+            _check(published := PublishedRun(run, info), row)
+        runs.append(published)
+    keys = {published.key for published in runs}
+    for name, by_run in ((EVALUATIONS, evaluations), (TRAINING, training)):
+        for key in by_run:
+            if key not in keys:
+                raise ValueError(f"{folder / name}: {' '.join(map(str, key))} is not in {RUNS}")
     return runs
+
+
+def _check(published: PublishedRun, row: Mapping[str, str]) -> None:
+    """Raise a ValueError if the files of a task do not agree about a run. `row` is its row of runs.csv."""
+    run = published.run
+    derived = published.row()
+    for name in ("state", "return_mean", "best_step", "commit"):
+        if row[name] != (text := str(_text(derived[name]))):
+            raise ValueError(f"{name} is {row[name]!r}, but the columns info and end say {text!r}")
+    if run.config.get("env") != run.task:
+        raise ValueError(f"it is a run of {run.config.get('env')}")
+    steps = run.evaluations.step
+    if run.result and (not len(steps) or steps[-1] != run.result["steps"]):
+        raise ValueError(f"its evaluations in {EVALUATIONS} do not reach step {run.result['steps']}")
 
 
 @contextmanager
@@ -165,7 +188,7 @@ def _key(row: Mapping[str, str]) -> Key:
 
 
 def _by_run(path: Path, parse: Callable[[list[dict[str, str]]], T]) -> dict[Key, T]:
-    """Apply `parse` to the rows of each run in the file `path`. Without such a file, there are no runs."""
+    """Apply `parse` to the rows of each run in the file `path`. Without such a file, no run has any."""
     rows = _read_table(path) if path.exists() else []
     with _named(str(path)):
         return {key: parse(list(group)) for key, group in groupby(rows, _key)}
@@ -190,11 +213,15 @@ def _evaluations(rows: Sequence[Mapping[str, str]]) -> Evaluations:
 def _read_table(path: Path) -> list[dict[str, str]]:
     with _named(str(path)):
         text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
-        rows = list(csv.DictReader(io.StringIO(text.decode(), newline="")))
-        for number, row in enumerate(rows, 1):
+        reader = csv.DictReader(io.StringIO(text.decode(), newline=""))
+        if not reader.fieldnames:
+            raise ValueError("it has no header")
+        rows = []
+        for row in reader:
             if None in row or None in row.values():
-                raise ValueError(f"row {number} does not have as many fields as the header")
+                raise ValueError(f"line {reader.line_num} does not have as many fields as the header")
             _key(row)
+            rows.append(row)
     return rows
 
 

@@ -21,7 +21,7 @@ COMMIT = "0123456789012345678901234567890123456789"
 def results(tmp_path):
     """Two seeds of SRad and of DPre on R+L2, finished, from a clean commit."""
     root = tmp_path / "results"
-    write_results(root, [("R+L2", "default")], ("DPre", "SRad"), seeds=2, evaluations=12)
+    write_results(root, [("R+L2", "default")], ("DPre", "SRad"), seeds=2)
     for folder in root.glob("*/*/seed=*"):
         result = json.loads((folder / "result.json").read_text())
         (folder / "result.json").write_text(json.dumps(result | {"steps": 300_000, "best_step": 60_000}))
@@ -105,6 +105,13 @@ def swapped(old, new):
         ("runs.csv", swapped("DPre,DPre,1,", "DPre,DPre,1,,,,,")),
         ("runs.csv", swapped(",finished,", ",finished\nDPre,DPre,7,")),
         ("runs.csv", swapped('{""algo""', '{""algo')),
+        ("runs.csv", lambda path: path.write_text("")),
+        ("runs.csv", lambda path: path.unlink()),
+        ("runs.csv", swapped(f",60000,{COMMIT}", f",60000,{'4' * 40}")),
+        ("runs.csv", swapped(",finished,", ",stopped,")),
+        ("evaluations.csv.gz", lambda path: path.unlink()),
+        ("evaluations.csv.gz", swapped("SRad,SRad,1,300000,", "SRad,SRad,7,300000,")),
+        ("evaluations.csv.gz", swapped("SRad,SRad,1,300000,", "SRad,SRad,1,299999,")),
     ],
 )
 def test_a_corrupt_file_is_named(results, tmp_path, capsys, name, spoil):
@@ -115,6 +122,13 @@ def test_a_corrupt_file_is_named(results, tmp_path, capsys, name, spoil):
     capsys.readouterr()
     assert publish(results, tmp_path / "data") == 2
     assert name in capsys.readouterr().err
+
+
+def test_a_folder_of_another_task_is_refused(results, tmp_path):
+    assert publish(results, tmp_path / "data") == 0
+    shutil.copytree(tmp_path / "data" / "R+L2", tmp_path / "data" / "R+M")
+    with pytest.raises(ValueError, match=r"R\+M.*DPre DPre 0: it is a run of R\+L2$"):
+        read_published(tmp_path / "data")
 
 
 def test_a_place_that_cannot_be_written_is_one_line(results, tmp_path, capsys):
@@ -176,13 +190,12 @@ def test_a_refused_run_keeps_its_whole_cell_back(results, tmp_path, capsys, reas
 
 
 def test_runs_with_other_settings_than_the_papers_are_published_for_the_asking_alone(results, tmp_path, capsys):
-    short = results / "R+L2" / "SRad,steps=90"
-    (results / "R+L2" / "SRad").rename(short)
+    other = results / "R+L2" / "SRad,gamma=0.5"
+    (results / "R+L2" / "SRad").rename(other)
     for seed in (0, 1):
-        edited("config.yaml", {"steps": 90})(short / f"seed={seed}")
-        edited("result.json", {"steps": 90})(short / f"seed={seed}")
+        edited("config.yaml", {"gamma": 0.5})(other / f"seed={seed}")
     assert publish(results, tmp_path / "data") == 1
-    assert "its settings are not the paper's: steps=90 (settings=any publishes it)" in capsys.readouterr().err
+    assert "its settings are not the paper's: gamma=0.5 (settings=any publishes it)" in capsys.readouterr().err
     assert {run.run.algo for run in read_published(tmp_path / "data")} == {"DPre"}
     assert publish(results, tmp_path / "data", "settings=any") == 0
     assert {run.run.algo for run in read_published(tmp_path / "data")} == {"DPre", "SRad"}

@@ -6,9 +6,9 @@
     python bench/publish.py results/ out=DIR                 # to another folder
 
 A cell (task, algorithm and settings) is published with all its seeds or not at all, so that no seed is dropped. A cell
-is refused if one of its runs has not ended, lacks its provenance, ran with uncommitted code or at several commits, has
-other settings than its folder's name says or, without `settings=any`, other settings than the paper's. A published seed
-is never replaced: another run of the same seed is refused, but not the rest of its cell. If runs are refused, the
+is refused if one of its runs has not ended, lacks its provenance, ran with uncommitted code, resumed at another commit,
+has other settings than its folder's name says or, without `settings=any`, other settings than the paper's. A published
+seed is never replaced: another run of the same seed is refused, but not the rest of its cell. If runs are refused, the
 command prints each with the reason, publishes the rest, and exits with code 1.
 
 The files are described in store/published.py; `python plot.py docs/data` makes tables and figures from them.
@@ -55,7 +55,8 @@ def publish(
         if (tasks is None or task in tasks) and (algos is None or parse_variant(variant)[0] in algos):
             cells[task, variant].append(folder)
     if not cells:
-        raise ConfigError(f"no runs of these tasks and algorithms in {root}")
+        which = "" if tasks is None and algos is None else " of these tasks and algorithms"
+        raise ConfigError(f"no runs{which} in {root} (looked for <task>/<algorithm>/seed=<n> in it)")
     there = {(run.run.task, *run.key): run for run in read_published(out)}
     fresh: dict[str, list[PublishedRun]] = defaultdict(list)
     published, refused = [], []
@@ -73,7 +74,7 @@ def publish(
             elif published_before.row() != run.row():
                 refused.append(f"{folder}: another run of this seed is published already")
         if problems:
-            refused += problems
+            refused += problems + [f"{run.run.folder}: another seed of its cell is refused" for run in ready]
         else:
             fresh[task] += ready
             published += [f"{task} {variant} seed {run.run.seed}: {run.state}" for run in ready]
@@ -89,9 +90,12 @@ def checked(folder: Path, any_settings: bool) -> PublishedRun:
         raise RefusedError("it has not ended")
     try:
         run = read_run(folder)
-        info = json.loads((folder / "info.json").read_text())
     except (OSError, ValueError) as error:
         raise RefusedError(one_line(error)) from error
+    try:
+        info = json.loads((folder / "info.json").read_text())
+    except (OSError, ValueError) as error:
+        raise RefusedError(f"info.json: {one_line(error)}") from error
     _check_provenance(info)
     _check_settings(run, any_settings)
     return PublishedRun(run, info)

@@ -6,6 +6,7 @@ It reads docs/data and replaces both tables. A test compares the tables with the
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from plots.grouping import DAGGER, count_diverged, final_return, group_runs, sta
 from plots.paper import COLORS, DEFAULT_BATCH, Statistic, order_algos, order_tasks, read_paper
 from plots.rewards import decimals
 from plots.starts import adjusted_returns, is_on_reacher
+from store.files import one_line
 from store.folder import Run
 from store.published import read_published
 from tables import MISSING
@@ -30,14 +32,16 @@ Cells = dict[str, dict[str, list[Run]]]
 def read_cells(root: str | Path) -> Cells:
     """The runs published in `root` that have the paper's own settings and a final result.
 
-    The result of a diverged run is that of its best parameters before. Raises ValueError if a file is corrupt, a run
-    repeats another, or a cell mixes settings.
+    The result of a diverged run is that of its best parameters before. Raises ValueError if there is no such run, a
+    file is corrupt, a run repeats another, or a cell mixes settings.
     """
     runs = [published.run for published in read_published(root)]
     groups, repeated = group_runs(run for run in runs if not run.overrides and _has_result(run))
     mixed = [f"{condition.label}: settings differ within a cell" for condition in groups if condition.settings]
     if repeated or mixed:
         raise ValueError("; ".join(repeated + mixed))
+    if not groups:
+        raise ValueError(f"no full-length runs in {root}")
     return {condition.task: groups[condition] for condition in groups}
 
 
@@ -131,7 +135,23 @@ def replace_table(text: str, table: str) -> str:
     return f"{before}{begin}{table}{end}{after}"
 
 
+def main(argv: Sequence[str]) -> int:
+    if argv:
+        print(__doc__)
+        return 0 if argv[0] in ("-h", "--help") else 2
+    try:
+        cells = read_cells(DATA)
+        texts = {path: replace_table(path.read_text(), make(cells)) for path, make in TABLES.items()}
+        for path, text in texts.items():
+            changed = text != path.read_text()
+            if changed:
+                path.write_text(text)
+            print(f"the table of {path.relative_to(ROOT)} {'has changed' if changed else 'is up to date'}")
+    except (OSError, ValueError) as error:
+        print(f"plots.reproduced: {one_line(error)}", file=sys.stderr)
+        return 2
+    return 0
+
+
 if __name__ == "__main__":
-    for path, make in TABLES.items():
-        path.write_text(replace_table(path.read_text(), make(read_cells(DATA))))
-        print(f"the table of {path.relative_to(ROOT)} is now made from docs/data")
+    sys.exit(main(sys.argv[1:]))

@@ -165,6 +165,8 @@ def edited(name, change):
 
 REFUSED = {
     "it has not ended": unfinished,
+    "info.json: no such file": lambda folder: (folder / "info.json").unlink(),
+    "info.json: Expecting value": lambda folder: (folder / "info.json").write_text(""),
     "its commit is not known": edited("info.json", {"commit": None}),
     "uncommitted changes": edited("info.json", {"dirty": True}),
     "uncommitted": edited("info.json", {"resumed": [{"commit": COMMIT, "dirty": True}]}),
@@ -186,6 +188,7 @@ def test_a_refused_run_keeps_its_whole_cell_back(results, tmp_path, capsys, reas
     assert publish(results, tmp_path / "data") == 1
     errors = capsys.readouterr().err
     assert "DPre/seed=1" in errors and reason in errors
+    assert "DPre/seed=0: another seed of its cell is refused" in errors
     assert [run.key for run in read_published(tmp_path / "data")] == [("SRad", "SRad", 0), ("SRad", "SRad", 1)]
 
 
@@ -245,6 +248,7 @@ def test_a_published_run_is_not_replaced(results, tmp_path, capsys):
         (["nowhere"], "nowhere is not a folder"),
         (["{results}", "algo=SRat"], "did you mean SRad?"),
         (["{results}", "env=W+M"], "no runs of these tasks"),
+        (["{results}/R+L2"], "no runs in"),
         (["{results}", "to=x"], "unknown key 'to'"),
     ],
 )

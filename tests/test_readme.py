@@ -8,6 +8,7 @@ import pytest
 
 from algos import ALGORITHMS, PAPER
 from envs import TASKS
+from plots import reproduced
 from plots.paper import read_paper
 from plots.reproduced import DATA, TABLES, details, overview, read_cells, replace_table
 from store.published import PublishedRun, read_published, write_published
@@ -114,6 +115,22 @@ def test_a_cell_of_mixed_settings_is_refused(tmp_path):
     write_published(tmp_path / "R+L2", [run, PublishedRun(other, run.info)])
     with pytest.raises(ValueError, match="settings differ"):
         read_cells(tmp_path)
+
+
+def test_the_command_changes_a_table_only_if_the_data_has(tmp_path, monkeypatch, capsys):
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{reproduced.BEGIN}| old |\n{reproduced.END}after\n")
+    monkeypatch.setattr(reproduced, "ROOT", tmp_path)
+    monkeypatch.setattr(reproduced, "TABLES", {page: overview})
+    assert reproduced.main([]) == 0 and "| Pro | **" in page.read_text()
+    assert reproduced.main([]) == 0
+    assert capsys.readouterr().out == "the table of page.md has changed\nthe table of page.md is up to date\n"
+    assert reproduced.main(["--help"]) == 0 and reproduced.main(["results"]) == 2
+    monkeypatch.setattr(reproduced, "DATA", tmp_path)
+    before = page.read_text()
+    capsys.readouterr()
+    assert reproduced.main([]) == 2 and page.read_text() == before
+    assert capsys.readouterr().err == f"plots.reproduced: no full-length runs in {tmp_path}\n"
 
 
 def test_a_text_without_a_place_for_the_table_is_refused():

@@ -32,10 +32,14 @@ from core.words import ConfigError, parse_words, split_names
 from envs import TASKS
 from store.files import one_line, user_path
 from store.folder import Run, find_runs, has_ended, parse_variant, read_run, variant_folder, variant_name
-from store.published import PublishedRun, read_published, write_published
+from store.published import PublishedRun, check_evaluations, read_published, write_published
 from sweep.cells import paper_config
 
 OUT = "docs/data"
+
+
+_DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
+"""The errors that files of a run cause if another program wrote or damaged them."""
 
 
 class RefusedError(Exception):
@@ -90,15 +94,22 @@ def checked(folder: Path, any_settings: bool) -> PublishedRun:
         raise RefusedError("it has not ended")
     try:
         run = read_run(folder)
-    except (OSError, ValueError) as error:
-        raise RefusedError(one_line(error)) from error
+        if run.result and run.failure:
+            raise RefusedError("it has result.json and failed.json")
+        _check_settings(run, any_settings)
+        check_evaluations(run)
+    except _DAMAGED as error:
+        raise RefusedError(_reason(error)) from error
     try:
         info = json.loads((folder / "info.json").read_text())
-    except (OSError, ValueError) as error:
-        raise RefusedError(f"info.json: {one_line(error)}") from error
-    _check_provenance(info)
-    _check_settings(run, any_settings)
+        _check_provenance(info)
+    except _DAMAGED as error:
+        raise RefusedError(f"info.json: {_reason(error)}") from error
     return PublishedRun(run, info)
+
+
+def _reason(error: Exception) -> str:
+    return f"no {error}" if isinstance(error, KeyError) else one_line(error)
 
 
 def _check_provenance(info: Mapping[str, Any]) -> None:

@@ -34,8 +34,10 @@ OnEmpty = Literal["error", "least"]
 AT_FACE = 1.0 - 1e-9
 """The box holds a coordinate of a projection from this absolute value on: rounding may have moved it off the face."""
 
-_DERIVED = {"center", "gauge", "ray", "alpha_map", "radial_map", "gauge_map"}
-_DERIVED |= {"radial_log_prob", "gauge_log_prob", "alpha_log_prob"}
+_DERIVED = (
+    *("center", "gauge", "ray", "alpha_map", "radial_map", "gauge_map"),
+    *("radial_log_prob", "gauge_log_prob", "alpha_log_prob"),
+)
 """Methods that a subclass must not override. Maps and densities call each other's parts, so some calls would bypass the
 override: an actor would train with one centre and be evaluated with another."""
 
@@ -70,10 +72,10 @@ class Constraint(ABC):
     solved_on_cpu: bool = False
     """True if a solver runs on the CPU. A GPU has to wait for it, and a CUDA graph cannot contain it."""
 
-    def __init_subclass__(cls, **kwargs: Any):
+    def __init_subclass__(cls, **kwargs: Any) -> None:
         """Raise TypeError for an override of a method in `_DERIVED`."""
         super().__init_subclass__(**kwargs)
-        if wrong := sorted(_DERIVED & vars(cls).keys()):
+        if wrong := [name for name in _DERIVED if getattr(cls, name) is not getattr(Constraint, name)]:
             raise TypeError(
                 f"{cls.__name__} overrides {', '.join(wrong)}, but some calls would bypass that: override _center or"
                 " _gauge_gradients (general sets: _part_gauges; an ellipse's centre: c), or write a map (core/maps.py)"

@@ -126,27 +126,27 @@ TABLES = {ROOT / "README.md": overview, ROOT / "docs" / "results.md": details}
 """The function that makes the table of each document."""
 
 
-def replace_table(text: str, table: str) -> str:
-    """`text` with `table` between the two marks. Raises ValueError if a mark is missing."""
+def replace_table(text: str, table: str, name: str) -> str:
+    """The `text` of the page `name` with `table` between the two marks. Raises ValueError if a mark is missing."""
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
-        raise ValueError(f"no table between {BEGIN.strip()!r} and {END.strip()!r}")
+        raise ValueError(f"{name}: no table between {BEGIN.strip()!r} and {END.strip()!r}")
     return f"{before}{begin}{table}{end}{after}"
 
 
 def main(argv: Sequence[str]) -> int:
     if argv:
         print(__doc__)
-        return 0 if argv[0] in ("-h", "--help") else 2
+        return 0 if argv[0] in ("-h", "--help") else 2  # it has no arguments
     try:
         cells = read_cells(DATA)
-        texts = {path: replace_table(path.read_text(), make(cells)) for path, make in TABLES.items()}
+        texts = {path: replace_table(path.read_text(), make(cells), path.name) for path, make in TABLES.items()}
         for path, text in texts.items():
             changed = text != path.read_text()
             if changed:
                 path.write_text(text)
-            print(f"the table of {path.relative_to(ROOT)} {'has changed' if changed else 'is up to date'}")
+            print(f"the table of {path.relative_to(ROOT)} {'is replaced' if changed else 'is up to date'}")
     except (OSError, ValueError) as error:
         print(f"plots.reproduced: {one_line(error)}", file=sys.stderr)
         return 2

@@ -19,10 +19,10 @@ import io
 import json
 import math
 import zlib
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -58,11 +58,14 @@ class PublishedRun:
     def row(self) -> dict[str, Any]:
         """Its row of runs.csv."""
         end = self.run.result or self.run.failure or {}
+        # A run that diverged has the result of its best parameters, unless that evaluation failed too.
+        result = end.get("result") if self.run.failure else end
+        result = result if isinstance(result, dict) else {}
         return {
             **dict(zip(KEY, self.key, strict=True)),
             "state": self.state,
-            "return_mean": end.get("return_mean"),
-            "best_step": end.get("best_step"),
+            "return_mean": result.get("return_mean"),
+            "best_step": result.get("best_step"),
             "commit": self.info.get("commit"),
             "config": json.dumps(self.run.config),
             "info": json.dumps(dict(self.info)),
@@ -123,17 +126,20 @@ def _training_rows(run: PublishedRun) -> list[dict[str, Any]]:
 
 
 def _task_folders(root: str | Path) -> list[Path]:
-    """The folders in `root` with published runs, also if one of their files is missing: to read it is then an error."""
-    return sorted({path.parent for name in (RUNS, EVALUATIONS) for path in Path(root).glob(f"*/{name}")})
+    """The folders in `root` with published runs, even if a file is missing; reading then raises an error."""
+    names = (RUNS, EVALUATIONS, TRAINING)
+    return sorted({path.parent for name in names for path in Path(root).glob(f"*/{name}")})
 
 
 def _read_task(folder: Path) -> list[PublishedRun]:
     evaluations = _by_run(folder / EVALUATIONS, _evaluations)
     training = _by_run(folder / TRAINING, _columns)
-    runs = []
+    runs: dict[Key, PublishedRun] = {}
     for row in _read_table(folder / RUNS):
         key = algo, variant, seed = _key(row)
         with _named(f"{folder / RUNS}: {' '.join(map(str, key))}"):
+            if key in runs:
+                raise ValueError("it has two rows")
             config, info, end = (json.loads(row[column]) for column in ("config", "info", "end"))
             run = Run(
                 folder=folder / variant / f"seed={seed}",
@@ -145,31 +151,30 @@ def _read_task(folder: Path) -> list[PublishedRun]:
                 config=config,
                 evaluations=evaluations.get(key) or _evaluations([]),
                 training=training.get(key, {}),
-                result=end if row["state"] == "finished" else None,
-                failure=end if row["state"] == "failed" else None,
+                result=end if end and "quantity" not in end else None,
+                failure=end if "quantity" in end else None,
             )
-            _check(published := PublishedRun(run, info), row)
-        runs.append(published)
-    keys = {published.key for published in runs}
+            runs[key] = PublishedRun(run, info)
+            derived = runs[key].row()
+            for name in ("state", "return_mean", "best_step", "commit"):
+                if row[name] != (text := str(_text(derived[name]))):
+                    raise ValueError(f"{name} is {row[name]!r}, but the columns info and end say {text!r}")
+            if config["env"] != folder.name:
+                raise ValueError(f"its task is {config['env']}")
+        with _named(f"{folder / EVALUATIONS}: {' '.join(map(str, key))}"):
+            check_evaluations(run)
     for name, by_run in ((EVALUATIONS, evaluations), (TRAINING, training)):
         for key in by_run:
-            if key not in keys:
+            if key not in runs:
                 raise ValueError(f"{folder / name}: {' '.join(map(str, key))} is not in {RUNS}")
-    return runs
+    return list(runs.values())
 
 
-def _check(published: PublishedRun, row: Mapping[str, str]) -> None:
-    """Raise a ValueError if the files of a task do not agree about a run. `row` is its row of runs.csv."""
-    run = published.run
-    derived = published.row()
-    for name in ("state", "return_mean", "best_step", "commit"):
-        if row[name] != (text := str(_text(derived[name]))):
-            raise ValueError(f"{name} is {row[name]!r}, but the columns info and end say {text!r}")
-    if run.config.get("env") != run.task:
-        raise ValueError(f"it is a run of {run.config.get('env')}")
+def check_evaluations(run: Run) -> None:
+    """Raise a ValueError if the evaluations of a finished run do not reach the end of its training."""
     steps = run.evaluations.step
     if run.result and (not len(steps) or steps[-1] != run.result["steps"]):
-        raise ValueError(f"its evaluations in {EVALUATIONS} do not reach step {run.result['steps']}")
+        raise ValueError(f"its evaluations do not reach step {run.result['steps']}")
 
 
 @contextmanager
@@ -188,10 +193,12 @@ def _key(row: Mapping[str, str]) -> Key:
 
 
 def _by_run(path: Path, parse: Callable[[list[dict[str, str]]], T]) -> dict[Key, T]:
-    """Apply `parse` to the rows of each run in the file `path`. Without such a file, no run has any."""
-    rows = _read_table(path) if path.exists() else []
+    """Apply `parse` to the rows of each run in the file `path`. A missing file counts as empty."""
+    by_run: dict[Key, list[dict[str, str]]] = defaultdict(list)
+    for row in _read_table(path) if path.exists() else []:
+        by_run[_key(row)].append(row)
     with _named(str(path)):
-        return {key: parse(list(group)) for key, group in groupby(rows, _key)}
+        return {key: parse(rows) for key, rows in by_run.items()}
 
 
 def _columns(rows: Sequence[Mapping[str, str]]) -> dict[str, np.ndarray]:

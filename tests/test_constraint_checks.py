@@ -121,6 +121,15 @@ def test_methods_that_others_bypass_are_not_overridden(base, name):
         type("Mine", (base,), {name: lambda self, obs: obs})
 
 
+def test_a_mixin_does_not_override_them_either():
+    class Centred:
+        def center(self, obs):
+            return obs
+
+    with pytest.raises(TypeError, match="^Mine overrides center,"):
+        type("Mine", (Centred, Ball), {})
+
+
 def test_a_centre_of_ones_own_serves_every_map():
     class Corner(LinearConstraint):
         def _center(self, at):

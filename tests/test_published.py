@@ -75,6 +75,34 @@ def test_no_training_rows_of_replaced_runs_stay(results, tmp_path):
     assert not (folder / "training.csv.gz").exists()
 
 
+def test_rows_of_evaluations_may_have_any_order(results, tmp_path):
+    assert publish(results, tmp_path) == 0
+    before = [contents(p.run) for p in read_published(tmp_path)]
+    path = tmp_path / "R+L2" / "evaluations.csv.gz"
+    header, *rows = gzip.decompress(path.read_bytes()).decode().splitlines()
+    rows.sort(key=lambda row: int(row.split(",")[3]))
+    path.write_bytes(gzip.compress("\n".join([header, *rows]).encode()))
+    assert [contents(p.run) for p in read_published(tmp_path)] == before
+
+
+def test_a_diverged_run_has_the_result_of_its_best_parameters(results, tmp_path):
+    folder = results / "R+L2" / "DPre" / "seed=0"
+    (folder / "result.json").unlink()
+    failure = {"step": 300_000, "quantity": "actor loss", "result": {"return_mean": 3.5, "best_step": 5_000}}
+    for result, expected in (
+        (failure["result"], ("3.5", "5000")),
+        ("final evaluation: refused", ("", "")),
+        (None, ("", "")),
+    ):
+        (folder / "failed.json").write_text(json.dumps(failure | {"result": result}))
+        out = tmp_path / str(expected[0] or result)
+        assert publish(results, out) == 0
+        published = next(p for p in read_published(out) if p.key == ("DPre", "DPre", 0))
+        assert published.state == "failed" and published.run.failure["result"] == result
+        row = next(row for row in (out / "R+L2" / "runs.csv").read_text().splitlines() if row.startswith("DPre,DPre,0"))
+        assert row.split(",")[3:6] == ["failed", *expected]
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[:-20])
 
@@ -109,6 +137,8 @@ def swapped(old, new):
         ("runs.csv", lambda path: path.unlink()),
         ("runs.csv", swapped(f",60000,{COMMIT}", f",60000,{'4' * 40}")),
         ("runs.csv", swapped(",finished,", ",stopped,")),
+        ("runs.csv", swapped(",finished,", ",failed,")),
+        ("runs.csv", lambda path: path.write_text(path.read_text() + path.read_text().splitlines()[-1])),
         ("evaluations.csv.gz", lambda path: path.unlink()),
         ("evaluations.csv.gz", swapped("SRad,SRad,1,300000,", "SRad,SRad,7,300000,")),
         ("evaluations.csv.gz", swapped("SRad,SRad,1,300000,", "SRad,SRad,1,299999,")),
@@ -127,7 +157,7 @@ def test_a_corrupt_file_is_named(results, tmp_path, capsys, name, spoil):
 def test_a_folder_of_another_task_is_refused(results, tmp_path):
     assert publish(results, tmp_path / "data") == 0
     shutil.copytree(tmp_path / "data" / "R+L2", tmp_path / "data" / "R+M")
-    with pytest.raises(ValueError, match=r"R\+M.*DPre DPre 0: it is a run of R\+L2$"):
+    with pytest.raises(ValueError, match=r"R\+M.*DPre DPre 0: its task is R\+L2$"):
         read_published(tmp_path / "data")
 
 
@@ -163,10 +193,34 @@ def edited(name, change):
     return edit
 
 
+def without(name, key):
+    def remove(folder):
+        path = folder / name
+        parse, write = (yaml.safe_load, yaml.safe_dump) if name.endswith("yaml") else (json.loads, json.dumps)
+        content = parse(path.read_text())
+        del content[key]
+        path.write_text(write(content))
+
+    return remove
+
+
+def without_the_last_evaluation(folder):
+    path = folder / "evaluations.csv"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+
+
 REFUSED = {
     "it has not ended": unfinished,
     "info.json: no such file": lambda folder: (folder / "info.json").unlink(),
     "info.json: Expecting value": lambda folder: (folder / "info.json").write_text(""),
+    "info.json: 'list' object": lambda folder: (folder / "info.json").write_text("[]"),
+    "info.json: no 'dirty'": edited("info.json", {"sources": [{"file": "my.py", "commit": COMMIT}]}),
+    "no 'steps'": without("result.json", "steps"),
+    "seed=1: ": without("config.yaml", "env"),
+    "its evaluations do not reach step 300000": without_the_last_evaluation,
+    "it has result.json and failed.json": lambda folder: (folder / "failed.json").write_text(
+        '{"step": 7, "quantity": "actor loss"}'
+    ),
     "its commit is not known": edited("info.json", {"commit": None}),
     "uncommitted changes": edited("info.json", {"dirty": True}),
     "uncommitted": edited("info.json", {"resumed": [{"commit": COMMIT, "dirty": True}]}),

@@ -66,7 +66,7 @@ def test_the_tables_have_every_task_and_algorithm_of_the_paper_and_no_unknown_on
 @pytest.mark.parametrize("path", TABLES, ids=lambda path: path.stem)
 def test_the_tables_of_what_is_reproduced_are_those_of_the_runs(path):
     table = TABLES[path](read_cells(DATA))
-    assert replace_table(path.read_text(), table) == path.read_text(), "run python -m plots.reproduced"
+    assert replace_table(path.read_text(), table, path.name) == path.read_text(), "run python -m plots.reproduced"
 
 
 def test_a_run_with_other_settings_or_without_result_is_not_reproduced(tmp_path):
@@ -124,7 +124,7 @@ def test_the_command_changes_a_table_only_if_the_data_has(tmp_path, monkeypatch,
     monkeypatch.setattr(reproduced, "TABLES", {page: overview})
     assert reproduced.main([]) == 0 and "| Pro | **" in page.read_text()
     assert reproduced.main([]) == 0
-    assert capsys.readouterr().out == "the table of page.md has changed\nthe table of page.md is up to date\n"
+    assert capsys.readouterr().out == "the table of page.md is replaced\nthe table of page.md is up to date\n"
     assert reproduced.main(["--help"]) == 0 and reproduced.main(["results"]) == 2
     monkeypatch.setattr(reproduced, "DATA", tmp_path)
     before = page.read_text()
@@ -134,8 +134,8 @@ def test_the_command_changes_a_table_only_if_the_data_has(tmp_path, monkeypatch,
 
 
 def test_a_text_without_a_place_for_the_table_is_refused():
-    with pytest.raises(ValueError, match="no table between"):
-        replace_table("no marks", "| |\n")
+    with pytest.raises(ValueError, match="^page.md: no table between"):
+        replace_table("no marks", "| |\n", "page.md")
 
 
 def test_the_tree_of_the_code_is_the_one_on_disk():
